@@ -64,7 +64,7 @@ def test_a_call_that_succeeded_ended_its_trouble() -> None:
     stream = Stream(None, accepted=True)
     assert isinstance(stage.answer(), Open)
     assert stage.answer(stream) == Read(stream)
-    event = job_pb2.JobEvent(name=NAME, sequence=5)
+    event = job_pb2.JobEvent(job=NAME, sequence=5)
     assert stage.answer(event) == Emit(event)
     assert stage.answer() == Read(stream)
     clock.now += 3600.0

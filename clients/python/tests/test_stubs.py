@@ -10,6 +10,8 @@ import pytest
 from google.protobuf import descriptor_pb2
 
 from scpsfm._stubs import (
+    admin_service_pb2,
+    admin_service_pb2_grpc,
     calibration_service_pb2,
     calibration_service_pb2_grpc,
     input_pb2,
@@ -27,6 +29,7 @@ PROTO = Path(__file__).resolve().parents[3] / "proto"
 MODULES = {
     module.DESCRIPTOR.name: module
     for module in (
+        admin_service_pb2,
         calibration_service_pb2,
         input_pb2,
         input_service_pb2,
@@ -38,6 +41,7 @@ MODULES = {
     )
 }
 SERVICES = {
+    "AdminService": (admin_service_pb2, admin_service_pb2_grpc),
     "CalibrationService": (calibration_service_pb2, calibration_service_pb2_grpc),
     "InputService": (input_service_pb2, input_service_pb2_grpc),
     "JobService": (job_service_pb2, job_service_pb2_grpc),

@@ -9,7 +9,7 @@ async fn a_full_queue_refuses_at_once_and_takes_on_again() {
     let mut options = workers(1);
     options.queue.max_jobs = 1;
     options.retry_after = Duration::from_secs(17);
-    let bench = TrackClassifier::start(options).await;
+    let bench = TestEngine::start(options).await;
     bench.submit(Script::Wait).await;
     bench.gate.until_waiting(1).await;
     let waiting = bench.submit(Script::Wait).await;
@@ -26,7 +26,7 @@ async fn a_full_queue_refuses_at_once_and_takes_on_again() {
 
 #[tokio::test]
 async fn one_request_is_one_job_however_often_it_is_sent() {
-    let bench = TrackClassifier::start(workers(1)).await;
+    let bench = TestEngine::start(workers(1)).await;
     let request = |script| NewJob { request_id: Some("r-1".into()), ..new_job(script) };
     let calls = (0..20).map(|_| bench.engine.submit(request(Script::Succeed)));
     let jobs = futures_util::future::join_all(calls).await;
@@ -53,7 +53,7 @@ async fn one_request_is_one_job_however_often_it_is_sent() {
 
 #[tokio::test]
 async fn bad_arguments_name_their_field() {
-    let bench = TrackClassifier::start(workers(1)).await;
+    let bench = TestEngine::start(workers(1)).await;
     let fields = |error: Error| match error {
         Error::InvalidArgument(invalid) => {
             invalid.violations().iter().map(|violation| violation.field.clone()).collect::<Vec<_>>()
@@ -78,7 +78,7 @@ async fn bad_arguments_name_their_field() {
 
 #[tokio::test]
 async fn job_ids_are_the_callers_or_made() {
-    let bench = TrackClassifier::start(workers(1)).await;
+    let bench = TestEngine::start(workers(1)).await;
     let mine = || NewJob { job_id: Some("mine".into()), ..new_job(Script::Succeed) };
     let job = bench.engine.submit(mine()).await.expect("admitted");
     assert_eq!(job.name.to_string(), "tenants/default/jobs/mine");
@@ -94,7 +94,7 @@ async fn job_ids_are_the_callers_or_made() {
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn a_hundred_jobs_of_twenty_callers_on_two_workers_all_end() {
-    let bench = TrackClassifier::start(workers(2)).await;
+    let bench = TestEngine::start(workers(2)).await;
     let callers = (0..20).map(|_| {
         let engine = bench.engine.clone();
         tokio::spawn(async move {

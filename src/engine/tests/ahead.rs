@@ -13,8 +13,8 @@ use crate::store::Lease;
 const ALWAYS: Duration = Duration::from_secs(3_600);
 
 /// One worker on a job that runs until the gate opens, and another job that is in its hands behind it.
-async fn foreseen() -> (TrackClassifier, [JobName; 2]) {
-    let bench = TrackClassifier::start(Options { short_job: ALWAYS, ..workers(1) }).await;
+async fn foreseen() -> (TestEngine, [JobName; 2]) {
+    let bench = TestEngine::start(Options { short_job: ALWAYS, ..workers(1) }).await;
     let both = vec![new_job(Script::Wait), new_job(Script::Succeed)];
     let created = bench.engine.submit_batch(both).await.expect("admitted");
     let names = [created[0].name.clone(), created[1].name.clone()];
@@ -23,25 +23,25 @@ async fn foreseen() -> (TrackClassifier, [JobName; 2]) {
 }
 
 /// Until the second of two jobs is in the hands of the worker that solves the first one.
-async fn handed_over(bench: &TrackClassifier, second: &JobName) {
+async fn handed_over(bench: &TestEngine, second: &JobName) {
     eventually(|| async { is_foreseen(bench, second).then_some(()) }).await;
     // It is foreseen before its input is read. What follows an attempt begins with handing it over.
     eventually(|| async { (bench.engine.inner.hub.topic_count() == 2).then_some(()) }).await;
 }
 
 /// Until nothing is foreseen or running. A job's end is in the store a little before its attempt is off the list.
-async fn nothing_is_left(bench: &TrackClassifier) {
+async fn nothing_is_left(bench: &TestEngine) {
     let inner = &bench.engine.inner;
     eventually(|| async { (locked(&inner.foreseen).is_empty() && locked(&inner.running).is_empty()).then_some(()) })
         .await;
 }
 
-fn is_foreseen(bench: &TrackClassifier, name: &JobName) -> bool {
+fn is_foreseen(bench: &TestEngine, name: &JobName) -> bool {
     locked(&bench.engine.inner.foreseen).contains_key(name)
 }
 
 /// The states that a job has been in.
-async fn states(bench: &TrackClassifier, name: &JobName) -> Vec<JobState> {
+async fn states(bench: &TestEngine, name: &JobName) -> Vec<JobState> {
     let events = bench.store.events_after(name, 0, 100).await.expect("events");
     assert_contiguous(&events, 1);
     let state = |event: &JobEvent| match event.body {
@@ -69,7 +69,7 @@ async fn a_foreseen_job_waits_as_any_other_and_is_solved_next() {
 
 #[tokio::test]
 async fn behind_a_job_that_turns_out_long_nothing_is_foreseen_any_more() {
-    let bench = TrackClassifier::start(Options { short_job: Duration::from_secs(2), ..workers(1) }).await;
+    let bench = TestEngine::start(Options { short_job: Duration::from_secs(2), ..workers(1) }).await;
     let both = vec![new_job(Script::Wait), new_job(Script::Succeed)];
     let created = bench.engine.submit_batch(both).await.expect("admitted");
     let next = &created[1].name;
@@ -119,7 +119,7 @@ async fn cancelled_between_its_begin_and_its_lease_it_leaves_nothing() {
 
 #[tokio::test]
 async fn what_was_begun_and_cannot_be_leased_is_stopped_and_solved_later() {
-    let bench = TrackClassifier::start(Options { short_job: ALWAYS, ..workers(1) }).await;
+    let bench = TestEngine::start(Options { short_job: ALWAYS, ..workers(1) }).await;
     let both = vec![new_job(Script::Wait), new_job(Script::Wait)];
     let created = bench.engine.submit_batch(both).await.expect("admitted");
     let [first, next] = [&created[0].name, &created[1].name];
@@ -164,7 +164,7 @@ async fn a_drain_leaves_it_in_the_queue() {
     assert_eq!(drain.await.expect("no panic"), Drained { finished: 1, given_back: 0 });
     assert_eq!(bench.engine.job(&solved).await.expect("exists").state, JobState::Succeeded);
     assert_eq!(states(&bench, &next).await, [JobState::Queued]);
-    let TrackClassifier { engine, store, gate, directory } = bench;
+    let TestEngine { engine, store, gate, directory } = bench;
     drop((engine, store));
     let (engine, _store) = start(workers(1), &directory, &gate).await;
     assert_eq!(ended(&engine, &next).await.attempt, 1);
@@ -172,7 +172,7 @@ async fn a_drain_leaves_it_in_the_queue() {
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn what_an_idle_worker_can_take_waits_for_no_other() {
-    let bench = TrackClassifier::start(Options { short_job: ALWAYS, ..workers(2) }).await;
+    let bench = TestEngine::start(Options { short_job: ALWAYS, ..workers(2) }).await;
     for round in 1..=20 {
         let both = vec![new_job(Script::Wait), new_job(Script::Succeed)];
         let created = bench.engine.submit_batch(both).await.expect("admitted");

@@ -7,7 +7,7 @@ use crate::engine::{Deadline, Error};
 
 #[tokio::test]
 async fn a_job_runs_to_its_result() {
-    let bench = TrackClassifier::start(workers(1)).await;
+    let bench = TestEngine::start(workers(1)).await;
     let new = NewJob { labels: [("a".to_owned(), "b".to_owned())].into(), ..new_job(Script::Succeed) };
     let job = bench.engine.submit(new).await.expect("admitted");
     assert_eq!((job.state, job.attempt, job.observation_count), (JobState::Queued, 0, 4));
@@ -29,7 +29,7 @@ async fn a_job_runs_to_its_result() {
 
 #[tokio::test]
 async fn a_defect_fails_its_job_and_the_worker_goes_on() {
-    let bench = TrackClassifier::start(workers(1)).await;
+    let bench = TestEngine::start(workers(1)).await;
     for (script, message) in [(Script::Fail, "told to fail"), (Script::Panic, "the solver panicked: told to panic")] {
         let name = bench.submit(script).await;
         let job = bench.ended(&name).await;
@@ -44,7 +44,7 @@ async fn a_defect_fails_its_job_and_the_worker_goes_on() {
 
 #[tokio::test]
 async fn an_input_that_cannot_be_read_fails_its_job() {
-    let bench = TrackClassifier::start(workers(1)).await;
+    let bench = TestEngine::start(workers(1)).await;
     let broken = crate::store::NewRecord {
         name: JobName { tenant: DEFAULT_TENANT.into(), job: "broken".into() },
         request: None,
@@ -71,7 +71,7 @@ async fn an_input_that_cannot_be_read_fails_its_job() {
 
 #[tokio::test]
 async fn a_cancel_reaches_a_queued_a_running_and_no_ended_job() {
-    let bench = TrackClassifier::start(workers(1)).await;
+    let bench = TestEngine::start(workers(1)).await;
     let running = bench.submit(Script::Wait).await;
     bench.gate.until_waiting(1).await;
     let queued = bench.submit(Script::Wait).await;
@@ -93,7 +93,7 @@ async fn a_cancel_reaches_a_queued_a_running_and_no_ended_job() {
 #[tokio::test]
 async fn a_cancel_that_another_process_stored_arrives_with_a_heartbeat() {
     let options = Options { lease: Duration::from_millis(300), max_attempts: u32::MAX, ..workers(1) };
-    let bench = TrackClassifier::start(options).await;
+    let bench = TestEngine::start(options).await;
     let name = bench.submit(Script::Wait).await;
     bench.gate.until_waiting(1).await;
     bench.store.request_cancel(&name, None, SystemTime::now()).await.expect("flags");
@@ -102,7 +102,7 @@ async fn a_cancel_that_another_process_stored_arrives_with_a_heartbeat() {
 
 #[tokio::test]
 async fn a_deadline_ends_a_running_and_a_queued_job() {
-    let bench = TrackClassifier::start(workers(1)).await;
+    let bench = TestEngine::start(workers(1)).await;
     let soon = Some(Deadline::After(Duration::from_millis(200)));
     let running = bench.engine.submit(NewJob { deadline: soon, ..new_job(Script::Wait) }).await.expect("admitted");
     let long_ago = Some(Deadline::At(SystemTime::UNIX_EPOCH));
@@ -118,7 +118,7 @@ async fn a_deadline_ends_a_running_and_a_queued_job() {
 #[tokio::test]
 async fn priority_goes_before_age() {
     // What is foreseen while one job is there goes first also where a more important one comes a moment later.
-    let bench = TrackClassifier::start(Options { short_job: Duration::ZERO, ..workers(1) }).await;
+    let bench = TestEngine::start(Options { short_job: Duration::ZERO, ..workers(1) }).await;
     let first = bench.submit(Script::Wait).await;
     bench.gate.until_waiting(1).await;
     let mut names = vec![first];

@@ -174,14 +174,14 @@ fn new_job(script: Script) -> NewJob {
 }
 
 /// An engine over a store in a directory of its own.
-struct TrackClassifier {
+struct TestEngine {
     engine: Engine,
     store: Arc<Sqlite>,
     gate: Arc<Gate>,
     directory: TempDir,
 }
 
-impl TrackClassifier {
+impl TestEngine {
     async fn start(options: Options) -> Self {
         let directory = tempfile::tempdir().expect("a temporary directory");
         let gate = Arc::new(Gate::default());

@@ -9,7 +9,7 @@ use crate::engine::{Drained, Error, StoreState, locked};
 
 #[tokio::test]
 async fn a_drain_lets_what_runs_finish_and_leaves_what_waits() {
-    let bench = TrackClassifier::start(workers(1)).await;
+    let bench = TestEngine::start(workers(1)).await;
     let running = bench.submit(Script::Wait).await;
     bench.gate.until_waiting(1).await;
     let queued = bench.submit(Script::Wait).await;
@@ -27,7 +27,7 @@ async fn a_drain_lets_what_runs_finish_and_leaves_what_waits() {
 #[tokio::test]
 async fn who_is_in_a_hurry_waits_for_no_drain() {
     for before in [true, false] {
-        let bench = TrackClassifier::start(workers(1)).await;
+        let bench = TestEngine::start(workers(1)).await;
         let name = bench.submit(Script::Wait).await;
         bench.gate.until_waiting(1).await;
         if before {
@@ -43,14 +43,14 @@ async fn who_is_in_a_hurry_waits_for_no_drain() {
         assert_eq!(drained, Drained { finished: 0, given_back: 1 }, "before: {before}");
         assert_eq!(bench.engine.job(&name).await.expect("exists").state, JobState::Queued);
     }
-    let idle = TrackClassifier::start(workers(1)).await;
+    let idle = TestEngine::start(workers(1)).await;
     idle.engine.hurry();
     assert_eq!(idle.engine.drain(Duration::from_secs(3600)).await, Drained::default(), "nothing runs");
 }
 
 #[tokio::test]
 async fn those_who_follow_the_store_hear_of_changes_alone() {
-    let bench = TrackClassifier::start(workers(1)).await;
+    let bench = TestEngine::start(workers(1)).await;
     let mut states = bench.engine.store_state();
     let look = async || {
         for _ in 0..3 {
@@ -84,7 +84,7 @@ async fn those_who_follow_the_store_hear_of_changes_alone() {
 async fn what_is_claimed_while_a_drain_gives_back_goes_back_too() {
     // The claim is on its way to the store when the drain looks for what runs: after one of these turns, or some.
     for turns in 0..8 {
-        let bench = TrackClassifier::start(workers(1)).await;
+        let bench = TestEngine::start(workers(1)).await;
         let name = bench.submit(Script::Wait).await;
         for _ in 0..turns {
             tokio::task::yield_now().await;
@@ -97,7 +97,7 @@ async fn what_is_claimed_while_a_drain_gives_back_goes_back_too() {
 
 #[tokio::test]
 async fn a_drain_gives_back_what_does_not_finish_and_the_next_engine_takes_it_up() {
-    let bench = TrackClassifier::start(workers(2)).await;
+    let bench = TestEngine::start(workers(2)).await;
     let names = [bench.submit(Script::Wait).await, bench.submit(Script::Wait).await, bench.submit(Script::Wait).await];
     bench.gate.until_waiting(2).await;
     let mut watch = bench.engine.watch(&names[0], 0).await.expect("exists");
@@ -111,7 +111,7 @@ async fn a_drain_gives_back_what_does_not_finish_and_the_next_engine_takes_it_up
     };
     assert_eq!(end, Error::Draining);
     assert!(watch.next().await.is_none());
-    let TrackClassifier { engine, store, gate, directory } = bench;
+    let TestEngine { engine, store, gate, directory } = bench;
     for name in &names {
         assert_eq!(engine.job(name).await.expect("exists").state, JobState::Queued);
     }
@@ -195,7 +195,7 @@ fn a_job_that_takes_its_process_down_each_time_fails() {
 async fn a_worker_whose_lease_was_taken_over_changes_nothing() {
     // Heartbeats far apart: the first worker learns of its loss only when it wants to write its result.
     let options = Options { lease: Duration::from_secs(3000), ..workers(2) };
-    let bench = TrackClassifier::start(options).await;
+    let bench = TestEngine::start(options).await;
     let name = bench.submit(Script::Deaf).await;
     bench.gate.until_waiting(1).await;
     let much_later = SystemTime::now() + Duration::from_secs(4000);
@@ -217,7 +217,7 @@ async fn a_worker_whose_lease_was_taken_over_changes_nothing() {
 #[tokio::test]
 async fn a_lost_lease_stops_the_work() {
     let options = Options { lease: Duration::from_millis(300), max_attempts: u32::MAX, ..workers(1) };
-    let bench = TrackClassifier::start(options).await;
+    let bench = TestEngine::start(options).await;
     let name = bench.submit(Script::Wait).await;
     bench.gate.until_waiting(1).await;
     let much_later = SystemTime::now() + Duration::from_secs(60);
@@ -236,7 +236,7 @@ const MENDED: &str = "DROP TRIGGER broken; DROP TRIGGER IF EXISTS broken_too";
 
 #[tokio::test]
 async fn a_result_waits_for_a_store_that_comes_back_in_time() {
-    let bench = TrackClassifier::start(workers(1)).await;
+    let bench = TestEngine::start(workers(1)).await;
     let name = bench.submit(Script::Wait).await;
     bench.gate.until_waiting(1).await;
     bench.store.execute(NO_ENDS).await;
@@ -253,7 +253,7 @@ async fn a_result_waits_for_a_store_that_comes_back_in_time() {
 #[tokio::test]
 async fn without_a_store_for_a_lease_the_work_stops_and_later_goes_on_by_itself() {
     let options = Options { lease: Duration::from_millis(300), max_attempts: u32::MAX, ..workers(1) };
-    let bench = TrackClassifier::start(options).await;
+    let bench = TestEngine::start(options).await;
     let name = bench.submit(Script::Wait).await;
     bench.gate.until_waiting(1).await;
     bench.store.execute(NO_WRITES).await;
@@ -270,7 +270,7 @@ async fn without_a_store_for_a_lease_the_work_stops_and_later_goes_on_by_itself(
 
 #[tokio::test]
 async fn a_cancel_reaches_the_attempt_that_holds_the_lease_though_another_still_runs() {
-    let bench = TrackClassifier::start(Options { lease: Duration::from_secs(3000), ..workers(2) }).await;
+    let bench = TestEngine::start(Options { lease: Duration::from_secs(3000), ..workers(2) }).await;
     let name = bench.submit(Script::Deaf).await;
     bench.gate.until_waiting(1).await;
     bench.store.sweep(SystemTime::now() + Duration::from_secs(4000), 3).await.expect("sweeps");

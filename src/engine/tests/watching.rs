@@ -9,7 +9,7 @@ use crate::store::Lease;
 
 #[tokio::test]
 async fn the_first_progress_is_stored_while_the_job_runs_and_a_flood_is_thinned() {
-    let bench = TrackClassifier::start(workers(1)).await;
+    let bench = TestEngine::start(workers(1)).await;
     let name = bench.submit(Script::Chatter).await;
     let watch = bench.engine.watch(&name, 1).await.expect("exists").into_stream();
     let first: Vec<_> = watch.take(2).map(|event| event.expect("no error").body).collect().await;
@@ -27,7 +27,7 @@ async fn the_first_progress_is_stored_while_the_job_runs_and_a_flood_is_thinned(
 
 #[tokio::test]
 async fn a_slow_watcher_gets_the_latest_weights_only() {
-    let bench = TrackClassifier::start(workers(1)).await;
+    let bench = TestEngine::start(workers(1)).await;
     let blocker = bench.submit(Script::Wait).await;
     bench.gate.until_waiting(1).await;
     let name = bench.submit(Script::Weights).await;
@@ -59,7 +59,7 @@ async fn up_to_weights(watch: &mut crate::engine::Watch) -> Vec<JobEvent> {
 
 #[tokio::test]
 async fn a_watch_of_an_ended_job_replays_and_ends() {
-    let bench = TrackClassifier::start(workers(1)).await;
+    let bench = TestEngine::start(workers(1)).await;
     let name = bench.submit(Script::Succeed).await;
     let last = bench.ended(&name).await.last_sequence;
     for after in 0..=last {
@@ -73,7 +73,7 @@ async fn a_watch_of_an_ended_job_replays_and_ends() {
 
 #[tokio::test]
 async fn a_watch_goes_on_after_an_earlier_end_and_ends_with_the_last() {
-    let bench = TrackClassifier::start(workers(1)).await;
+    let bench = TestEngine::start(workers(1)).await;
     let name = bench.submit(Script::Fail).await;
     let batch = u64::from(crate::engine::watch::READ_AHEAD);
     let mut ends = vec![bench.ended(&name).await.last_sequence];
@@ -100,7 +100,7 @@ async fn a_watch_goes_on_after_an_earlier_end_and_ends_with_the_last() {
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn watchers_that_come_and_go_miss_and_repeat_nothing() {
     const EVENTS: u32 = 300;
-    let bench = TrackClassifier::start(workers(1)).await;
+    let bench = TestEngine::start(workers(1)).await;
     let name = bench.submit(Script::Wait).await;
     bench.gate.until_waiting(1).await;
     let lease = Lease { name: name.clone(), attempt: 1 };
@@ -141,7 +141,7 @@ async fn watchers_that_come_and_go_miss_and_repeat_nothing() {
 
 #[tokio::test]
 async fn a_watcher_that_leaves_is_forgotten_and_cancels_nothing() {
-    let bench = TrackClassifier::start(workers(1)).await;
+    let bench = TestEngine::start(workers(1)).await;
     let name = bench.submit(Script::Wait).await;
     bench.gate.until_waiting(1).await;
     let watches = futures_util::future::join_all((0..10).map(|_| bench.engine.watch(&name, 0))).await;

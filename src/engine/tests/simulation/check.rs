@@ -1,7 +1,5 @@
 //! What must hold, whatever happens.
 
-use std::hash::{DefaultHasher, Hash, Hasher};
-
 use tokio::runtime::Builder;
 
 use super::client::{Clients, Known, request};
@@ -31,10 +29,9 @@ pub(super) fn open_jobs(cluster: &Cluster) -> i64 {
     cluster.numbers("SELECT COUNT(*) AS number FROM jobs WHERE state IN ('QUEUED', 'RUNNING')")[0]
 }
 
-/// What is stored once everything has come to rest. Returns a digest of it.
-pub(super) fn at_the_end(cluster: &Cluster, clients: &Clients) -> Result<u64, String> {
+/// What is stored once everything has come to rest.
+pub(super) fn at_the_end(cluster: &Cluster, clients: &Clients) -> Result<(), String> {
     let store = cluster.connect::<true>(0);
-    let mut digest = DefaultHasher::new();
     let runtime = Builder::new_current_thread().enable_time().start_paused(true).build().expect("a runtime");
     runtime.block_on(async {
         let (jobs, sent) = clients.known();
@@ -48,9 +45,6 @@ pub(super) fn at_the_end(cluster: &Cluster, clients: &Clients) -> Result<u64, St
             let events = store.events_after(name, 0, u32::MAX).await.map_err(|error| error.to_string())?;
             told_once(&job, &events, known).map_err(|what| format!("{name}: {what}"))?;
             came_right(&store, &job).await.map_err(|what| format!("{name}: {what}"))?;
-            for event in &events {
-                (name.to_string(), event.attempt, event.sequence, format!("{:?}", event.body)).hash(&mut digest);
-            }
         }
         // Of requests without an answer there may be jobs, one each.
         let jobs = cluster.numbers("SELECT COUNT(*) AS number FROM jobs")[0];
@@ -60,7 +54,7 @@ pub(super) fn at_the_end(cluster: &Cluster, clients: &Clients) -> Result<u64, St
         let left = "SELECT COUNT(*) AS number FROM attempts WHERE ending IS NULL";
         let left = cluster.numbers(left)[0];
         ensure!(left == 0, "{left} attempts have no end");
-        Ok(digest.finish())
+        Ok(())
     })
 }
 
