@@ -194,6 +194,7 @@ pub async fn run(args: Args) -> Result<Exit, Failure> {
     let _tracing = telemetry::tracing::init(telemetry::tracing::Options {
         format: config.log.format,
         filter: &config.log.filter,
+        access: config.log.access,
         otlp_endpoint: config.otlp.endpoint.as_deref(),
         service_name: "scpsfm",
     })
@@ -224,18 +225,23 @@ pub async fn run(args: Args) -> Result<Exit, Failure> {
     follow_store(&ready, service.store_state());
     ready.set(true);
     let scheme = if config.tls.files().is_some() { "https" } else { "http" };
-    let store = match &config.store.url {
-        Some(url) => url.to_string(),
-        None => config.store.data_dir.display().to_string(),
+    let (store_kind, store) = match &config.store.url {
+        Some(url) => ("postgres", url.to_string()),
+        None => ("sqlite", config.store.data_dir.display().to_string()),
     };
+    let certificate = config.tls.files().and_then(|files| files.certificate());
     tracing::info!(
         version = env!("CARGO_PKG_VERSION"),
+        store_kind,
         store,
         grpc = %service.address(),
         scheme,
         http = service.http_address().map(|address| address.to_string()),
         metrics = %metrics.address(),
         recovered_jobs = service.recovered_jobs(),
+        queued_jobs = service.queued_jobs().await,
+        keys = service.key_count(),
+        certificate_end = certificate.map(|certificate| prost_types::Timestamp::from(certificate.end).to_string()),
         "serving"
     );
     print(&format!("grpc {scheme}://{}", service.address()))?;

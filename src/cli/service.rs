@@ -98,6 +98,16 @@ impl Service {
         self.engine.recovered_jobs()
     }
 
+    /// Jobs that wait; `None` where the store does not say.
+    pub async fn queued_jobs(&self) -> Option<u64> {
+        self.engine.load().await.ok().map(|load| load.queued)
+    }
+
+    /// API keys at the start; `None`: callers need none.
+    pub fn key_count(&self) -> Option<usize> {
+        self.server.key_count()
+    }
+
     /// What can be done with the store.
     pub fn store_state(&self) -> tokio::sync::watch::Receiver<engine::StoreState> {
         self.engine.store_state()
@@ -230,6 +240,7 @@ fn server_options(config: &Config) -> server::Options {
         },
         tls: config.tls.files(),
         keys: Sources { file: config.auth.keys_file.clone(), fixed: config.auth.keys.clone() },
+        rates: config.rates.options(),
         reflection: config.server.reflection,
         ..server::Options::default()
     }
@@ -261,7 +272,7 @@ mod tests {
             let keys = options.keys.is_on();
             let connections = (options.max_connections, options.auth_timeout);
             let bounds = (options.limits, options.max_message_bytes, options.max_inflight_bytes, connections);
-            (bounds, options.solve_grace, options.tls, keys, options.reflection)
+            (bounds, options.solve_grace, options.tls, keys, options.reflection, options.rates)
         };
         assert_eq!(of(server_options(&config)), of(server::Options::default()));
     }

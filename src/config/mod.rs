@@ -15,7 +15,7 @@ use serde::{Deserialize, Serialize};
 use crate::domain::Limits;
 use crate::store::postgres::DatabaseUrl;
 pub use retention::Retention;
-pub use sections::{Auth, Compute, Engine, Http, Log, Metrics, Otlp, Server, Store, Tls, Upload, Webhooks};
+pub use sections::{Auth, Compute, Engine, Http, Log, Metrics, Otlp, Rates, Server, Store, Tls, Upload, Webhooks};
 
 /// Everything that the server can be told.
 #[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
@@ -25,6 +25,7 @@ pub struct Config {
     pub http: Http,
     pub tls: Tls,
     pub auth: Auth,
+    pub rates: Rates,
     pub metrics: Metrics,
     pub store: Store,
     pub engine: Engine,
@@ -175,6 +176,11 @@ impl Config {
         at_least_one("upload.max_bytes", self.upload.max_bytes)?;
         at_least_one("upload.tenant_uploads", self.upload.tenant_uploads)?;
         at_least_one("upload.tenant_bytes", self.upload.tenant_bytes)?;
+        at_least_one("rates.calls_burst", u64::from(self.rates.calls_burst))?;
+        if self.rates.jobs_burst < Rates::LEAST_JOBS_BURST {
+            let found = self.rates.jobs_burst.to_string();
+            return Err(Error::Value { key: "rates.jobs_burst", found, right: "a number from 1000 on (a batch)" });
+        }
         if self.engine.workers > Engine::MOST_WORKERS {
             let found = self.engine.workers.to_string();
             return Err(Error::Value { key: "engine.workers", found, right: "a number up to 1024" });
@@ -203,11 +209,11 @@ impl Config {
                 right: "levels by module, such as `info` or `info,scpsfm::engine=debug`",
             });
         }
-        if let Some(endpoint) = self.otlp.endpoint.as_ref().filter(|endpoint| !is_plain_http(endpoint)) {
+        if let Some(endpoint) = self.otlp.endpoint.as_ref().filter(|endpoint| !is_collector(endpoint)) {
             return Err(Error::Value {
                 key: "otlp.endpoint",
                 found: format!("`{endpoint}`"),
-                right: "a collector's http:// address, such as http://127.0.0.1:4317 (TLS is not built in)",
+                right: "a collector's http:// or https:// address, such as http://127.0.0.1:4317",
             });
         }
         self.http.validate()?;
@@ -219,9 +225,9 @@ impl Config {
 /// The variables that name a key, i.e. have a section: `SCPSFM_ENGINE__WORKERS`. Others of our prefix, such as those
 /// that switch tests, are none of ours here; but `SCPSFM_ENGINE_WORKERS` is a slip that would go unseen.
 fn keys_among(variables: Vec<(String, String)>) -> Result<Vec<(String, String)>, Error> {
-    const SECTIONS: [&str; 13] = [
-        "SERVER", "HTTP", "TLS", "AUTH", "METRICS", "STORE", "ENGINE", "UPLOAD", "COMPUTE", "LIMITS", "LOG", "OTLP",
-        "WEBHOOKS",
+    const SECTIONS: [&str; 14] = [
+        "SERVER", "HTTP", "TLS", "AUTH", "RATES", "METRICS", "STORE", "ENGINE", "UPLOAD", "COMPUTE", "LIMITS", "LOG",
+        "OTLP", "WEBHOOKS",
     ];
     let mut keys = Vec::new();
     for (name, value) in variables {
@@ -235,9 +241,9 @@ fn keys_among(variables: Vec<(String, String)>) -> Result<Vec<(String, String)>,
     Ok(keys)
 }
 
-fn is_plain_http(endpoint: &str) -> bool {
+fn is_collector(endpoint: &str) -> bool {
     let uri: Result<axum::http::Uri, _> = endpoint.parse();
-    uri.is_ok_and(|uri| uri.scheme_str() == Some("http") && uri.host().is_some())
+    uri.is_ok_and(|uri| matches!(uri.scheme_str(), Some("http" | "https")) && uri.host().is_some())
 }
 
 #[cfg(test)]

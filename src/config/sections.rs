@@ -1,6 +1,7 @@
 //! The sections of the configuration, one type each, with every default and its reason.
 
 use std::net::{IpAddr, Ipv4Addr, SocketAddr};
+use std::num::NonZeroU32;
 use std::path::PathBuf;
 
 use axum::http::uri::Authority;
@@ -184,6 +185,46 @@ impl Auth {
     }
 }
 
+/// How often a key may call and a tenant create jobs, on each server. Off by default: any figure would be too low for
+/// somebody, as clients that create small jobs one by one call a thousand times a second, and the bounds of the queue
+/// and of memory hold without it.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(default, deny_unknown_fields)]
+pub struct Rates {
+    /// Calls a second of a key; without keys of all callers together. 0: any. Health checks do not count.
+    pub calls_per_second: u32,
+    /// Calls at once after a pause.
+    pub calls_burst: u32,
+    /// Jobs a second that a tenant creates; a batch counts its jobs. 0: any.
+    pub jobs_per_second: u32,
+    /// Jobs at once after a pause; at least a batch, [`Rates::LEAST_JOBS_BURST`].
+    pub jobs_burst: u32,
+}
+
+impl Rates {
+    /// Least that [`Rates::jobs_burst`] may be: a batch is taken whole, or would never be.
+    pub const LEAST_JOBS_BURST: u32 = rpc::jobs::MAX_BATCH as u32;
+
+    /// The rates that are on.
+    pub fn options(self) -> rpc::rates::Options {
+        let rate = |per_second, burst| {
+            let (per_second, burst) = (NonZeroU32::new(per_second)?, NonZeroU32::new(burst)?);
+            Some(rpc::rates::Rate { per_second, burst })
+        };
+        rpc::rates::Options {
+            calls: rate(self.calls_per_second, self.calls_burst),
+            jobs: rate(self.jobs_per_second, self.jobs_burst),
+        }
+    }
+}
+
+impl Default for Rates {
+    fn default() -> Self {
+        // A burst of calls is what a program with a hundred threads begins with.
+        Self { calls_per_second: 0, calls_burst: 100, jobs_per_second: 0, jobs_burst: Self::LEAST_JOBS_BURST }
+    }
+}
+
 /// The scrape port: `/metrics`, `/healthz`, `/readyz`.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
@@ -349,14 +390,17 @@ pub struct Log {
     /// `human` or `json`. Human, because who starts the server by hand reads it; deploy/ sets json.
     #[serde(deserialize_with = "word")]
     pub format: Format,
-    /// Levels by module, e.g. `info,scpsfm::engine=debug`.
+    /// Levels by module, e.g. `info,scpsfm::engine=debug`. The audit log (`scpsfm::audit`) is written whatever it says.
     pub filter: String,
+    /// Whether each call is a line (`scpsfm::access`) once it has ended.
+    pub access: bool,
 }
 
 impl Default for Log {
     fn default() -> Self {
-        // One line a state change of a job; debug would be one a store operation.
-        Self { format: Format::default(), filter: "info".into() }
+        // One line a state change of a job; debug would be one a store operation. No line a call: clients that poll
+        // make many for each job, refusals are told without it, and the audit log tells what changed.
+        Self { format: Format::default(), filter: "info".into(), access: false }
     }
 }
 
@@ -364,7 +408,8 @@ impl Default for Log {
 #[derive(Debug, Clone, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
 pub struct Otlp {
-    /// Collector (gRPC), e.g. `http://127.0.0.1:4317`. None by default: a server sends nothing anywhere unasked.
+    /// Collector (gRPC), e.g. `http://127.0.0.1:4317`, or `https://`, trusted by the system's authorities. None by
+    /// default: a server sends nothing anywhere unasked.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub endpoint: Option<String>,
 }

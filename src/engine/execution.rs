@@ -418,9 +418,13 @@ impl JobExecution {
         match (committed, ended_in) {
             (Some(job), Some(state)) => {
                 let seconds = job.start_time.zip(job.end_time).and_then(|(start, end)| end.duration_since(start).ok());
+                let summary = job.summary.as_ref();
                 tracing::info!(
+                    tenant = job.name.tenant,
+                    attempt = job.attempt,
                     state = state.name(),
-                    grade = job.summary.as_ref().and_then(|summary| summary.grade).map(Grade::name),
+                    grade = summary.and_then(|summary| summary.grade).map(Grade::name),
+                    focal_px = summary.and_then(|summary| summary.focal_px),
                     seconds = seconds.map(|seconds| seconds.as_secs_f64()),
                     "job ended"
                 );

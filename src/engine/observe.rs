@@ -7,8 +7,19 @@ pub(super) use crate::telemetry::metrics::{
 };
 pub(super) use crate::telemetry::{Attempt, waited};
 
+use std::time::SystemTime;
+
 use super::StoreState;
-use crate::telemetry::metrics::{store_full, store_reachable};
+use crate::store::StoreStats;
+use crate::telemetry::metrics::{queue_oldest, store_bytes, store_full, store_reachable, tenant_jobs};
+
+/// What operators watch, as of `now`.
+pub(super) fn store_stats(stats: StoreStats, now: SystemTime) {
+    store_bytes(stats.bytes);
+    // A clock that was set back gives no age.
+    queue_oldest(stats.oldest_queue_time.and_then(|time| now.duration_since(time).ok()).unwrap_or_default());
+    tenant_jobs(stats.tenants.into_iter().map(|of| (of.tenant, [of.queued, of.running])).collect());
+}
 
 pub(super) fn store_state(state: StoreState) {
     store_reachable(state != StoreState::Away);

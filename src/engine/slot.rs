@@ -22,6 +22,9 @@ const SWEEP_PERIOD: Duration = Duration::from_secs(1);
 /// Least time between two counts of the queue: each goes through all of it, and dashboards look every few seconds.
 const COUNT_PERIOD: Duration = Duration::from_millis(200);
 
+/// How often operators are told what takes longer to count, such as each tenant's jobs: three times a usual scrape.
+const STATS_PERIOD: Duration = Duration::from_secs(5);
+
 /// Jobs that one sweep removes at most, in one transaction: at one sweep a second more than any server solves, and
 /// writers wait for some hundred megabytes at worst.
 const PURGE_BATCH: u32 = 32;
@@ -140,6 +143,7 @@ pub(super) async fn sweep(inner: Arc<Inner>) {
     let mut ticks = tokio::time::interval(SWEEP_PERIOD);
     let mut counted = Instant::now();
     let mut paused = false;
+    let mut stats_due = Instant::now();
     ticks.set_missed_tick_behavior(tokio::time::MissedTickBehavior::Delay);
     while *phase.borrow_and_update() != Phase::Closed {
         tokio::select! {
@@ -153,6 +157,13 @@ pub(super) async fn sweep(inner: Arc<Inner>) {
                     continue;
                 }
                 inner.tidy().await;
+                if stats_due <= Instant::now() {
+                    stats_due = Instant::now() + STATS_PERIOD;
+                    match inner.store.stats().await {
+                        Ok(stats) => observe::store_stats(stats, inner.now()),
+                        Err(error) => tracing::warn!(%error, "cannot count the jobs of tenants"),
+                    }
+                }
             }
         }
         counted = Instant::now();

@@ -120,6 +120,11 @@ pub fn uncalled(refusal: HttpRefusal, status: &Status) -> Box<Answer> {
 
 /// A refusal before any call, of a kind that gRPC does not have.
 pub fn refuse(refusal: HttpRefusal, text: impl Into<String>) -> Box<Answer> {
+    uncalled(refusal, &status_of(refusal, text))
+}
+
+/// The status of such a refusal.
+pub fn status_of(refusal: HttpRefusal, text: impl Into<String>) -> Status {
     let code = match refusal {
         HttpRefusal::Origin | HttpRefusal::Host => Code::PermissionDenied,
         HttpRefusal::Path => Code::NotFound,
@@ -127,7 +132,7 @@ pub fn refuse(refusal: HttpRefusal, text: impl Into<String>) -> Box<Answer> {
         HttpRefusal::TooLarge => Code::OutOfRange,
         _ => Code::InvalidArgument,
     };
-    uncalled(refusal, &status::refused(code, refusal.reason(), text))
+    status::refused(code, refusal.reason(), text)
 }
 
 fn refused(code: StatusCode, status: &Status) -> Answer {

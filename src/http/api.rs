@@ -96,11 +96,11 @@ impl Api {
     ) -> Result<Answer, Box<Answer>> {
         if *origin == Origin::Other {
             let text = "a page of another site may not call this API: http.allowed_origins names those that may";
-            return Err(answer::refuse(HttpRefusal::Origin, text));
+            return Err(self.forbid(HttpRefusal::Origin, text, &introduction));
         }
         if !self.gateway.asks_for_keys() && !self.is_own_host(request.headers()) {
             let text = "the request is for a host that this server does not know: http.hosts names those that it has";
-            return Err(answer::refuse(HttpRefusal::Host, text));
+            return Err(self.forbid(HttpRefusal::Host, text, &introduction));
         }
         if *origin != Origin::Own && request.method() == Method::OPTIONS {
             return Ok(origin::preflight());
@@ -216,6 +216,13 @@ impl Api {
         permit.hold(JSON_COPIES * bytes.len() as u64).map_err(failed)?;
         let json = in_background(bytes.len(), move || answer::message(&output, &bytes)).await.map_err(failed)?;
         Ok(answer::json(json, permit))
+    }
+
+    /// Refuses a request for where it comes from or goes to, and writes that down.
+    fn forbid(&self, refusal: HttpRefusal, text: &str, introduction: &Introduction) -> Box<Answer> {
+        let status = answer::status_of(refusal, text);
+        self.gateway.tell_refused(&status, introduction);
+        answer::uncalled(refusal, &status)
     }
 
     /// Whether a request is for an address of this machine, or one of the names that it is known under.

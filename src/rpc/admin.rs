@@ -2,6 +2,7 @@
 
 use tonic::{Request, Response, Status};
 
+use super::caller::Caller;
 use super::convert::enums::Twin;
 use super::{proto, status};
 use crate::engine::{Engine, QueueReport, TenantQueue};
@@ -32,23 +33,29 @@ impl proto::admin_service_server::AdminService for Admin {
         self.queue().await
     }
 
-    async fn pause_queue(&self, _request: Request<proto::PauseQueueRequest>) -> Result<Response<proto::Queue>, Status> {
-        self.engine.pause().await.map_err(status::from_engine)?;
+    async fn pause_queue(&self, request: Request<proto::PauseQueueRequest>) -> Result<Response<proto::Queue>, Status> {
+        let (caller, engine) = (Caller::of(&request)?, self.engine.clone());
+        let work = async move { engine.pause().await.map(drop).map_err(status::from_engine) };
+        caller.audited("PauseQueue", "queue", work).await?;
         self.queue().await
     }
 
     async fn resume_queue(
         &self,
-        _request: Request<proto::ResumeQueueRequest>,
+        request: Request<proto::ResumeQueueRequest>,
     ) -> Result<Response<proto::Queue>, Status> {
-        self.engine.resume().await.map_err(status::from_engine)?;
+        let (caller, engine) = (Caller::of(&request)?, self.engine.clone());
+        let work = async move { engine.resume().await.map(drop).map_err(status::from_engine) };
+        caller.audited("ResumeQueue", "queue", work).await?;
         self.queue().await
     }
 
     async fn drain_server(
         &self,
-        _request: Request<proto::DrainServerRequest>,
+        request: Request<proto::DrainServerRequest>,
     ) -> Result<Response<proto::DrainServerResponse>, Status> {
+        let worker = &self.engine.options().worker_name;
+        Caller::of(&request)?.audit("DrainServer", worker, &Ok(()));
         self.engine.ask_for_drain();
         Ok(Response::new(proto::DrainServerResponse { worker: self.engine.options().worker_name.clone() }))
     }

@@ -1,8 +1,9 @@
-//! The layer that finds out whose call it is: before any service sees a request, its key becomes a tenant, and a call
-//! that the key's scope does not allow is refused. A call whose key is withdrawn while it lasts ends, in both
-//! directions.
+//! The layer that finds out whose call it is: before any service sees a request, its key becomes a tenant, a call that
+//! the key's scope does not allow is refused, and one that is allowed counts for the key's rate. A call whose key is
+//! withdrawn while it lasts ends, in both directions.
 
 use std::pin::Pin;
+use std::sync::Arc;
 use std::task::{Context, Poll};
 
 use http_body::{Body as HttpBody, Frame, SizeHint};
@@ -16,6 +17,8 @@ use tower::{Layer, Service};
 use super::caller::Tenant;
 use super::keys::{Grant, Hash, KeyRing};
 use super::listener::Introduction;
+use super::meter::CallRecord;
+use super::rates::Rates;
 use super::reload::Current;
 use super::{meter, status};
 
@@ -30,11 +33,17 @@ const GRPC: &str = "application/grpc";
 pub struct Authenticate {
     /// `None`: nobody needs a key, and everyone is of the default tenant.
     keys: Option<Current<KeyRing>>,
+    rates: Arc<Rates>,
+}
+
+/// Whether a path needs no key: such calls have no tenant and no rate.
+pub fn is_open(path: &str) -> bool {
+    path.starts_with(OPEN)
 }
 
 impl Authenticate {
-    pub fn new(keys: Option<Current<KeyRing>>) -> Self {
-        Self { keys }
+    pub fn new(keys: Option<Current<KeyRing>>, rates: Arc<Rates>) -> Self {
+        Self { keys, rates }
     }
 
     /// Whether keys are asked for.
@@ -177,7 +186,7 @@ where
     }
 
     fn call(&mut self, mut request: Request<Body>) -> Self::Future {
-        if request.uri().path().starts_with(OPEN) {
+        if is_open(request.uri().path()) {
             // Where keys are asked for, one who checks the server's health is still a stranger.
             if self.layer.keys.is_none() {
                 introduce(&request);
@@ -192,13 +201,22 @@ where
             }
         };
         introduce(&request);
+        let key = standing.as_ref().map(|standing| &standing.key);
+        if let Some(record) = CallRecord::of(request.extensions()) {
+            record.identify(tenant.id(), key.map(Hash::fingerprint));
+        }
         // Without keys everyone may do everything.
         let needed = meter::scope_of(request.uri().path());
-        if standing.as_ref().is_some_and(|standing| standing.grant.scope < needed) {
-            let refusal = status::scope_missing(needed).into_http();
+        let checked = match standing.as_ref().is_some_and(|standing| standing.grant.scope < needed) {
+            true => Err(status::scope_missing(needed)),
+            false => self.layer.rates.call(key),
+        };
+        if let Err(status) = checked {
+            let refusal = status.into_http();
             return Box::pin(async { Ok(refusal) });
         }
         request.extensions_mut().insert(tenant);
+        request.extensions_mut().insert(self.layer.rates.clone());
         // No service needs it any more, and none can let it slip.
         request.headers_mut().remove(AUTHORIZATION);
         let Some(standing) = standing else { return Box::pin(self.inner.call(request)) };
@@ -215,14 +233,18 @@ where
 
 #[cfg(test)]
 mod tests {
-    use std::sync::Arc;
-
+    use governor::clock::DefaultClock;
     use tokio::sync::watch;
     use tonic::Code;
 
     use super::*;
+    use crate::rpc::rates;
 
     const KEY: &str = "0123456789abcdef0123456789abcdef";
+
+    fn any_rate() -> Arc<Rates> {
+        Arc::new(Rates::new(rates::Options::default(), DefaultClock::default()))
+    }
 
     fn headers(values: &[&str]) -> HeaderMap {
         values.iter().map(|value| (AUTHORIZATION, value.parse().expect("a header"))).collect()
@@ -232,7 +254,7 @@ mod tests {
     fn a_key_becomes_its_tenant_and_nothing_else_does() {
         let ring = format!("north:{KEY}").parse().expect("a key");
         let (_sender, keys) = watch::channel(Arc::new(ring));
-        let layer = Authenticate::new(Some(keys));
+        let layer = Authenticate::new(Some(keys), any_rate());
         for right in ["Bearer", "bearer", "BEARER"] {
             let (tenant, _) = layer.admit(&headers(&[&format!("{right} {KEY}")])).expect("known");
             assert_eq!(tenant, Tenant::new("north"));
@@ -257,7 +279,7 @@ mod tests {
 
     #[test]
     fn without_keys_everyone_is_of_the_default_tenant() {
-        let (tenant, standing) = Authenticate::new(None).admit(&headers(&[])).expect("open");
+        let (tenant, standing) = Authenticate::new(None, any_rate()).admit(&headers(&[])).expect("open");
         assert!(tenant == Tenant::default() && standing.is_none());
     }
 }

@@ -69,17 +69,18 @@ impl Calibration {
     }
 
     /// Stores the job and attaches to it; the permit is held until then.
-    async fn submit(&self, new: engine::NewJob, permit: Permit) -> Result<AttachedCall, Status> {
-        let (engine, disconnects) = (self.engine.clone(), self.disconnects.clone());
+    async fn submit(&self, caller: &Caller, new: engine::NewJob, permit: Permit) -> Result<AttachedCall, Status> {
+        let (caller, engine, disconnects) = (caller.clone(), self.engine.clone(), self.disconnects.clone());
         let new = engine::NewJob { cancel_on_disconnect: true, ..new };
         // In a task of its own: if this call is dropped while the job is being stored, it attaches all the same, and
         // detaches when the task's outcome is dropped.
         let stored = async move {
             let _permit = permit;
-            engine.submit(new).await.map(|job| disconnects.attached(job))
+            let stored = engine.submit(new).await.map_err(status::from_engine);
+            caller.audit_jobs("Solve", stored.as_ref().map(std::slice::from_ref));
+            stored.map(|job| disconnects.attached(job))
         };
-        let outcome = tokio::spawn(stored.in_current_span()).await;
-        outcome.map_err(|error| status::internal(&error))?.map_err(status::from_engine)
+        tokio::spawn(stored.in_current_span()).await.map_err(|error| status::internal(&error))?
     }
 }
 
@@ -120,13 +121,14 @@ impl proto::calibration_service_server::CalibrationService for Calibration {
         request: Request<Streaming<proto::SolveRequest>>,
     ) -> Result<Response<Self::SolveStream>, Status> {
         let caller = Caller::of(&request)?;
+        caller.count_jobs(1)?;
         let span = telemetry::tracing::submit_span("Solve", caller.trace_parent());
         let accepted = async {
             let permit = Permit::of(&request)?;
             let submission = self.receive(&caller, &permit, request.into_inner()).await?;
             let trace_parent = telemetry::tracing::traceparent_to_store(&span, caller.trace_parent());
             let new = submission.close(trace_parent).await?;
-            let call = self.submit(new, permit).await?;
+            let call = self.submit(&caller, new, permit).await?;
             telemetry::tracing::record_job(&span, call.job());
             Ok::<_, Status>(call)
         };

@@ -1,16 +1,22 @@
 //! Who calls, and what that caller may name.
 
-use tonic::Request;
+use std::fmt::Display;
+use std::sync::Arc;
+
+use tonic::{Code, Request, Status};
+use tracing::Instrument;
 
 use super::convert::names;
 use super::keys::{Grant, Scope};
+use super::meter::{CallRecord, code_name};
+use super::rates::Rates;
 use super::status;
 use crate::domain::InputName;
-use crate::domain::job::{DEFAULT_TENANT, JobName};
-use tonic::Status;
+use crate::domain::job::{DEFAULT_TENANT, Job, JobName};
+use crate::telemetry::tracing::AUDIT;
 
 /// Header of the W3C trace context.
-const TRACE_PARENT: &str = "traceparent";
+pub const TRACE_PARENT: &str = "traceparent";
 
 /// The tenant of a call, as [`Authenticate`](super::auth::Authenticate) puts it into a request's extensions.
 #[derive(Debug, Clone, PartialEq, Eq)]
@@ -23,6 +29,10 @@ pub struct Tenant {
 impl Tenant {
     pub fn new(id: impl Into<String>) -> Self {
         Self { id: id.into(), reaches_all: false }
+    }
+
+    pub fn id(&self) -> &str {
+        &self.id
     }
 
     /// The tenant of a key.
@@ -43,6 +53,8 @@ impl Default for Tenant {
 pub struct Caller {
     tenant: Tenant,
     trace_parent: Option<String>,
+    rates: Option<Arc<Rates>>,
+    record: Option<Arc<CallRecord>>,
 }
 
 impl Caller {
@@ -54,7 +66,66 @@ impl Caller {
             return Err(status::internal(&"a request reached a service without a tenant"));
         };
         let trace_parent = request.metadata().get(TRACE_PARENT).and_then(|value| value.to_str().ok());
-        Ok(Self { tenant, trace_parent: trace_parent.map(str::to_owned) })
+        Ok(Self {
+            tenant,
+            trace_parent: trace_parent.map(str::to_owned),
+            rates: request.extensions().get().cloned(),
+            record: CallRecord::of(request.extensions()),
+        })
+    }
+
+    /// Counts jobs that the caller is about to create for its tenant's rate.
+    ///
+    /// # Errors
+    /// `RESOURCE_EXHAUSTED`, reason `RATE_LIMITED`.
+    pub fn count_jobs(&self, count: usize) -> Result<(), Status> {
+        self.rates.as_ref().map_or(Ok(()), |rates| rates.jobs(self.tenant.id(), count))
+    }
+
+    /// Writes into the audit log that the caller did this to the resource, or tried to.
+    pub fn audit<T>(&self, method: &'static str, resource: &dyn Display, outcome: &Result<T, Status>) {
+        self.write_audit(method, resource, outcome.as_ref().map_or_else(Status::code, |_| Code::Ok));
+    }
+
+    /// The same of the creation of jobs, a line each; where it was refused, of their tenant.
+    pub fn audit_jobs(&self, method: &'static str, created: Result<&[Job], &Status>) {
+        match created {
+            Ok(jobs) => jobs.iter().for_each(|job| self.write_audit(method, &job.name, Code::Ok)),
+            Err(status) => self.write_audit(method, &format_args!("tenants/{}", self.tenant.id()), status.code()),
+        }
+    }
+
+    /// Does something to the resource and writes it into the audit log. In a task of its own: if the call is dropped
+    /// meanwhile, what it did is written down all the same.
+    ///
+    /// # Errors
+    /// Those of `work`.
+    pub async fn audited<T: Send + 'static>(
+        self,
+        method: &'static str,
+        resource: impl Display + Send + Sync + 'static,
+        work: impl Future<Output = Result<T, Status>> + Send + 'static,
+    ) -> Result<T, Status> {
+        let doing = async move {
+            let outcome = work.await;
+            self.audit(method, &resource, &outcome);
+            outcome
+        };
+        tokio::spawn(doing.in_current_span()).await.map_err(|error| status::internal(&error))?
+    }
+
+    fn write_audit(&self, method: &'static str, resource: &dyn Display, code: Code) {
+        let record = self.record.as_deref();
+        tracing::info!(
+            target: AUDIT,
+            tenant = self.tenant.id(),
+            key = record.and_then(CallRecord::key),
+            peer = record.and_then(CallRecord::peer),
+            method,
+            resource = %resource,
+            code = code_name(code),
+            "audit"
+        );
     }
 
     /// The trace that the call belongs to.
@@ -99,8 +170,6 @@ impl Caller {
 
 #[cfg(test)]
 mod tests {
-    use tonic::Code;
-
     use super::*;
 
     #[test]

@@ -13,6 +13,7 @@ use tonic::body::Body;
 use tonic::codegen::http::{Request, Response};
 use tower::{Layer, Service};
 
+use super::meter::CallRecord;
 use super::status;
 use crate::telemetry::metrics::{Refusal, inflight_bytes, inflight_capacity, refused};
 
@@ -197,7 +198,8 @@ where
         };
         request.extensions_mut().insert(permit.clone());
         let answer_permit = permit.clone();
-        let answer = self.inner.call(request.map(|body| Body::new(ChargedBody { body, permit })));
+        let record = CallRecord::of(request.extensions());
+        let answer = self.inner.call(request.map(|body| Body::new(ChargedBody { body, permit, record })));
         Box::pin(async move { Ok(answer.await?.map(|body| Body::new(HeldBody { body, permit: answer_permit }))) })
     }
 }
@@ -233,6 +235,8 @@ impl<B: HttpBody + Unpin> HttpBody for HeldBody<B> {
 struct ChargedBody {
     body: Body,
     permit: Permit,
+    /// Counts what comes.
+    record: Option<Arc<CallRecord>>,
 }
 
 impl HttpBody for ChargedBody {
@@ -243,9 +247,14 @@ impl HttpBody for ChargedBody {
         let frame = Pin::new(&mut self.body).poll_frame(context);
         if let Poll::Ready(Some(Ok(frame))) = &frame
             && let Some(data) = frame.data_ref()
-            && let Err(refusal) = self.permit.receive(data.len() as u64)
         {
-            return Poll::Ready(Some(Err(refusal)));
+            let bytes = data.len() as u64;
+            if let Some(record) = &self.record {
+                record.receive(bytes);
+            }
+            if let Err(refusal) = self.permit.receive(bytes) {
+                return Poll::Ready(Some(Err(refusal)));
+            }
         }
         frame
     }

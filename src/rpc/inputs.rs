@@ -58,6 +58,19 @@ impl Inputs {
             return Err(status::invalid(&violation("start", "is not the first message")));
         };
         let new = Self::read_start(caller, start)?;
+        let name = new.name.clone();
+        let received = self.receive_upload(new, permit, messages).await;
+        caller.audit("UploadInput", &name, &received);
+        received
+    }
+
+    /// What follows the first message.
+    async fn receive_upload(
+        &self,
+        new: NewUpload,
+        permit: &Permit,
+        mut messages: Streaming<proto::UploadInputRequest>,
+    ) -> Result<proto::Input, Status> {
         permit.hold(RECEPTION_BYTES)?;
         let upload = match self.engine.begin_upload(new).await.map_err(status::from_engine)? {
             Begun::Finished(input) => return Ok(input::uploaded_to_wire(&input)),
@@ -295,8 +308,10 @@ impl proto::input_service_server::InputService for Inputs {
     }
 
     async fn delete_input(&self, request: Request<proto::DeleteInputRequest>) -> Result<Response<()>, Status> {
-        let name = Caller::of(&request)?.input(&request.get_ref().name, "name")?;
-        self.engine.delete_input(&name).await.map_err(status::from_engine)?;
-        Ok(Response::new(()))
+        let caller = Caller::of(&request)?;
+        let name = caller.input(&request.get_ref().name, "name")?;
+        let (engine, resource) = (self.engine.clone(), name.clone());
+        let delete = async move { engine.delete_input(&name).await.map_err(status::from_engine) };
+        caller.audited("DeleteInput", resource, delete).await.map(Response::new)
     }
 }

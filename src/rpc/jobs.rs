@@ -130,13 +130,14 @@ type Messages<T> = Pin<Box<dyn Stream<Item = Result<T, Status>> + Send>>;
 impl proto::job_service_server::JobService for Jobs {
     async fn create_job(&self, request: Request<proto::CreateJobRequest>) -> Result<Response<proto::Job>, Status> {
         let caller = Caller::of(&request)?;
+        caller.count_jobs(1)?;
         let span = telemetry::tracing::submit_span("CreateJob", caller.trace_parent());
         let created = async {
             let permit = Permit::of(&request)?;
             let submission = Submission::open(&caller, request.into_inner(), &self.limits, &permit)?;
             let trace_parent = telemetry::tracing::traceparent_to_store(&span, caller.trace_parent());
             let new = submission.close(trace_parent).await?;
-            let stored = submission::store(&self.engine, vec![new], permit).await?.pop();
+            let stored = submission::store(&caller, "CreateJob", &self.engine, vec![new], permit).await?.pop();
             let created = stored.ok_or_else(|| status::internal(&"one job was to be stored, none was"))?;
             telemetry::tracing::record_job(&span, &created.name);
             Ok(Response::new(job::to_wire(&created)))
@@ -149,13 +150,15 @@ impl proto::job_service_server::JobService for Jobs {
         request: Request<proto::BatchCreateJobsRequest>,
     ) -> Result<Response<proto::BatchCreateJobsResponse>, Status> {
         let caller = Caller::of(&request)?;
+        // A batch that is longer than it may be is refused below, whatever the rate.
+        caller.count_jobs(request.get_ref().requests.len().min(MAX_BATCH))?;
         let span = telemetry::tracing::submit_span("BatchCreateJobs", caller.trace_parent());
         let created = async {
             let permit = Permit::of(&request)?;
             let proto::BatchCreateJobsRequest { parent, requests } = request.into_inner();
             let trace_parent = telemetry::tracing::traceparent_to_store(&span, caller.trace_parent());
             let news = self.read_batch(&caller, &parent, requests, trace_parent, &permit).await?;
-            let created = submission::store(&self.engine, news, permit).await?;
+            let created = submission::store(&caller, "BatchCreateJobs", &self.engine, news, permit).await?;
             Ok(Response::new(proto::BatchCreateJobsResponse { jobs: created.iter().map(job::to_wire).collect() }))
         };
         created.instrument(span.clone()).await
@@ -202,23 +205,31 @@ impl proto::job_service_server::JobService for Jobs {
     }
 
     async fn cancel_job(&self, request: Request<proto::CancelJobRequest>) -> Result<Response<proto::Job>, Status> {
-        let name = Caller::of(&request)?.job(&request.get_ref().name)?;
+        let caller = Caller::of(&request)?;
+        let name = caller.job(&request.get_ref().name)?;
         let etag = Some(request.into_inner().etag).filter(|etag| !etag.is_empty());
-        let cancelled = self.engine.cancel_as_of(&name, etag).await.map_err(status::from_engine)?;
+        let (engine, resource) = (self.engine.clone(), name.clone());
+        let cancel = async move { engine.cancel_as_of(&name, etag).await.map_err(status::from_engine) };
+        let cancelled = caller.audited("CancelJob", resource, cancel).await?;
         Ok(Response::new(job::to_wire(&cancelled)))
     }
 
     async fn delete_job(&self, request: Request<proto::DeleteJobRequest>) -> Result<Response<()>, Status> {
-        let name = Caller::of(&request)?.job(&request.get_ref().name)?;
-        let etag = Some(request.get_ref().etag.as_str()).filter(|etag| !etag.is_empty());
-        self.engine.delete(&name, etag).await.map_err(status::from_engine)?;
-        Ok(Response::new(()))
+        let caller = Caller::of(&request)?;
+        let name = caller.job(&request.get_ref().name)?;
+        let etag = Some(request.into_inner().etag).filter(|etag| !etag.is_empty());
+        let (engine, resource) = (self.engine.clone(), name.clone());
+        let delete = async move { engine.delete(&name, etag.as_deref()).await.map_err(status::from_engine) };
+        caller.audited("DeleteJob", resource, delete).await.map(Response::new)
     }
 
     async fn retry_job(&self, request: Request<proto::RetryJobRequest>) -> Result<Response<proto::Job>, Status> {
-        let name = Caller::of(&request)?.job(&request.get_ref().name)?;
+        let caller = Caller::of(&request)?;
+        let name = caller.job(&request.get_ref().name)?;
         let etag = Some(request.into_inner().etag).filter(|etag| !etag.is_empty());
-        let retried = self.engine.retry(&name, etag).await.map_err(status::from_engine)?;
+        let (engine, resource) = (self.engine.clone(), name.clone());
+        let retry = async move { engine.retry(&name, etag).await.map_err(status::from_engine) };
+        let retried = caller.audited("RetryJob", resource, retry).await?;
         Ok(Response::new(job::to_wire(&retried)))
     }
 
@@ -226,11 +237,15 @@ impl proto::job_service_server::JobService for Jobs {
         &self,
         request: Request<proto::SetJobPriorityRequest>,
     ) -> Result<Response<proto::Job>, Status> {
-        let name = Caller::of(&request)?.job(&request.get_ref().name)?;
+        let caller = Caller::of(&request)?;
+        let name = caller.job(&request.get_ref().name)?;
         let proto::SetJobPriorityRequest { priority, etag, .. } = request.into_inner();
         create::check_priority(priority, "priority").map_err(|found| status::invalid(&found.into()))?;
-        let etag = Some(etag.as_str()).filter(|etag| !etag.is_empty());
-        let changed = self.engine.set_priority(&name, etag, priority).await.map_err(status::from_engine)?;
+        let etag = Some(etag).filter(|etag| !etag.is_empty());
+        let (engine, resource) = (self.engine.clone(), name.clone());
+        let change =
+            async move { engine.set_priority(&name, etag.as_deref(), priority).await.map_err(status::from_engine) };
+        let changed = caller.audited("SetJobPriority", resource, change).await?;
         Ok(Response::new(job::to_wire(&changed)))
     }
 

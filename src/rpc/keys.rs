@@ -19,6 +19,9 @@ const MIN_KEY_CHARS: usize = 32;
 /// Longest key: well above what any generator makes, well below what a header may hold.
 const MAX_KEY_CHARS: usize = 256;
 
+/// Of a key's hash in logs: the keys of a server are too few for two to share these.
+const FINGERPRINT_BYTES: usize = 4;
+
 /// Before the hash of a key that is not written itself.
 const HASHED: &str = "sha256:";
 
@@ -28,12 +31,17 @@ const FORM: &str = "TENANT:[SCOPE:]KEY or TENANT:[SCOPE:]sha256:HEX";
 type Digest = [u8; 32];
 
 /// What is kept of a key that a caller presented, to see later whether it still stands.
-#[derive(Clone, PartialEq, Eq)]
+#[derive(Clone, PartialEq, Eq, Hash)]
 pub struct Hash(Digest);
 
 impl Hash {
     pub fn of(key: &str) -> Self {
         Self(digest(key.as_bytes()))
+    }
+
+    /// The first digits of the key's SHA-256, for logs: enough to find its line in a file of keys, and no way back.
+    pub fn fingerprint(&self) -> String {
+        self.0[..FINGERPRINT_BYTES].iter().map(|byte| format!("{byte:02x}")).collect()
     }
 }
 

@@ -7,6 +7,7 @@ mod unauthenticated;
 use std::collections::VecDeque;
 use std::convert::Infallible;
 use std::io;
+use std::net::SocketAddr;
 use std::pin::Pin;
 use std::sync::Arc;
 use std::task::{Context, Poll};
@@ -152,8 +153,8 @@ impl ConnectionListener {
                 Some(ended) = self.handshaking.join_next() => match ended {
                     Ok(Ok(begun)) => match self.permits.clone().try_acquire_owned() {
                         Ok(permit) => {
-                            let Begun { io, early } = begun;
-                            let auth_deadline = AuthDeadline::begin(self.options.auth_timeout);
+                            let Begun { io, early, peer } = begun;
+                            let auth_deadline = AuthDeadline::begin(self.options.auth_timeout, peer);
                             return Connection { io, early, auth_deadline, _held: (permit, metrics::connection()) };
                         }
                         Err(_) => self.refuse(begun),
@@ -206,7 +207,7 @@ impl ConnectionListener {
         let is_http_1 = self.options.protocol.is_some();
         tokio::spawn(async move {
             let _place = place;
-            let Begun { mut io, early } = begun;
+            let Begun { mut io, early, .. } = begun;
             if is_http_1 {
                 let told = async {
                     io.write_all(NO_ROOM_HTTP_1).await?;
@@ -238,6 +239,7 @@ impl ConnectionListener {
 /// Shakes hands, where there is TLS, and waits for the first words.
 async fn begin(connection: TcpStream, acceptor: Option<TlsAcceptor>) -> io::Result<Begun> {
     connection.set_nodelay(true)?;
+    let peer = connection.peer_addr().ok();
     let mut io: Box<dyn Io> = match acceptor {
         Some(acceptor) => Box::new(acceptor.accept(connection).await?),
         None => Box::new(connection),
@@ -253,7 +255,7 @@ async fn begin(connection: TcpStream, acceptor: Option<TlsAcceptor>) -> io::Resu
         }
         early.extend_from_slice(&rest[..count]);
     }
-    Ok(Begun { io, early: early.into() })
+    Ok(Begun { io, early: early.into(), peer })
 }
 
 /// Reads what comes after the preface until a call begins, or what no server allows.
@@ -273,6 +275,7 @@ async fn first_call(io: &mut dyn Io) -> io::Result<()> {
 struct Begun {
     io: Box<dyn Io>,
     early: Bytes,
+    peer: Option<SocketAddr>,
 }
 
 /// A connection, encrypted or not.

@@ -1,17 +1,27 @@
-//! Counts every call by method and status code, from the request's headers to the last byte of its answer.
+//! Counts every call by method and status code, from the request's headers to the last byte of its answer, and writes
+//! it down: a line a call in the access log, and refusals in the log, of which anyone can cause many and few are told.
 
+use std::net::SocketAddr;
 use std::pin::Pin;
+use std::sync::atomic::{AtomicU64, Ordering};
+use std::sync::{Arc, OnceLock};
 use std::task::{Context, Poll};
 
 use http_body::{Body as HttpBody, Frame};
 use prost::bytes::Bytes;
 use tonic::body::Body;
-use tonic::codegen::http::{HeaderMap, Request, Response};
+use tonic::codegen::http::{Extensions, Request, Response};
 use tonic::{Code, Status};
+use tonic_types::StatusExt;
 use tower::{Layer, Service};
 
+use super::auth::is_open;
+use super::caller::TRACE_PARENT;
 use super::keys::Scope::{self, Admin, Ordinary, ReadOnly};
+use super::listener::Introduction;
 use crate::telemetry::metrics::{RpcCall, UNKNOWN_METHOD};
+use crate::telemetry::throttle::Throttle;
+use crate::telemetry::tracing::ACCESS;
 
 /// Every method that this server offers, with the scope that a key needs for it. The path of a request is only looked
 /// up here: taken as a label, it would let a client make series without end.
@@ -56,15 +66,101 @@ pub fn scope_of(path: &str) -> Scope {
     find(path).map_or(Scope::ReadOnly, |(_, scope)| scope)
 }
 
+/// What is known of a call while it is under way, for whoever writes of it; in its request's extensions.
+#[derive(Debug, Default)]
+pub struct CallRecord {
+    peer: Option<SocketAddr>,
+    trace: Option<String>,
+    caller: OnceLock<(String, Option<String>)>,
+    received_bytes: AtomicU64,
+}
+
+impl CallRecord {
+    /// The record of a call that came through the [`Meter`].
+    pub fn of(extensions: &Extensions) -> Option<Arc<Self>> {
+        extensions.get().cloned()
+    }
+
+    fn begin<B>(request: &Request<B>) -> Self {
+        let trace_parent = request.headers().get(TRACE_PARENT).and_then(|value| value.to_str().ok());
+        Self {
+            peer: request.extensions().get::<Introduction>().and_then(Introduction::peer),
+            trace: trace_parent.and_then(trace_id),
+            ..Self::default()
+        }
+    }
+
+    /// Whose call it is, once that is known; `key` is a fingerprint.
+    pub fn identify(&self, tenant: &str, key: Option<String>) {
+        // A call is identified once.
+        let _ = self.caller.set((tenant.to_owned(), key));
+    }
+
+    /// So many bytes of the request have come.
+    pub fn receive(&self, bytes: u64) {
+        self.received_bytes.fetch_add(bytes, Ordering::Relaxed);
+    }
+
+    /// Fingerprint of the caller's key.
+    pub fn key(&self) -> Option<&str> {
+        self.caller.get()?.1.as_deref()
+    }
+
+    /// Where the call comes from.
+    pub fn peer(&self) -> Option<String> {
+        self.peer.map(|peer| peer.to_string())
+    }
+
+    fn tenant(&self) -> Option<&str> {
+        Some(&self.caller.get()?.0)
+    }
+}
+
+/// The trace's id in a W3C `traceparent`; nothing else of what a client sent goes into a log.
+fn trace_id(trace_parent: &str) -> Option<String> {
+    let id = trace_parent.split('-').nth(1)?;
+    (id.len() == 32 && id.bytes().all(|byte| byte.is_ascii_hexdigit())).then(|| id.to_owned())
+}
+
+/// Codes of calls that are refused for what the caller is or does, not for what the call asks.
+const REFUSALS: [Code; 3] = [Code::Unauthenticated, Code::PermissionDenied, Code::ResourceExhausted];
+
+/// Writes refusals down, those of each code apart: callers without a key hide none of a full queue.
+#[derive(Debug, Clone, Default)]
+pub struct RefusalLog([Throttle; REFUSALS.len()]);
+
+impl RefusalLog {
+    /// Writes it down where it is a refusal, and there is room for one more line.
+    pub fn tell(&self, status: &Status, method: &'static str, record: &CallRecord) {
+        let Some(kind) = REFUSALS.into_iter().position(|code| code == status.code()) else { return };
+        let code = code_name(status.code());
+        if self.0[kind].allows(move |count| tracing::warn!(code, count, "more refusals were left out of the log")) {
+            let info = status.get_details_error_info();
+            let reason = info.as_ref().map(|info| info.reason.as_str());
+            let bound = info.as_ref().and_then(|info| info.metadata.get("bound")).map(String::as_str);
+            let (tenant, key, peer) = (record.tenant(), record.key(), record.peer());
+            tracing::warn!(code, reason, bound, method, tenant, key, peer, "refused");
+        }
+    }
+
+    /// The same of a request that is refused before it becomes a call.
+    pub fn tell_early(&self, status: &Status, introduction: &Introduction) {
+        let record = CallRecord { peer: introduction.peer(), ..CallRecord::default() };
+        self.tell(status, UNKNOWN_METHOD, &record);
+    }
+}
+
 /// The layer; goes around everything else.
-#[derive(Debug, Clone, Copy, Default)]
-pub struct Meter;
+#[derive(Debug, Clone, Default)]
+pub struct Meter {
+    pub refusals: RefusalLog,
+}
 
 impl<S> Layer<S> for Meter {
     type Service = Metered<S>;
 
     fn layer(&self, inner: S) -> Metered<S> {
-        Metered { inner }
+        Metered { inner, refusals: self.refusals.clone() }
     }
 }
 
@@ -72,6 +168,7 @@ impl<S> Layer<S> for Meter {
 #[derive(Debug, Clone)]
 pub struct Metered<S> {
     inner: S,
+    refusals: RefusalLog,
 }
 
 impl<S, B> Service<Request<B>> for Metered<S>
@@ -87,15 +184,23 @@ where
         self.inner.poll_ready(context)
     }
 
-    fn call(&mut self, request: Request<B>) -> Self::Future {
-        let call = RpcCall::begin(method_of(request.uri().path()));
+    fn call(&mut self, mut request: Request<B>) -> Self::Future {
+        let path = request.uri().path();
+        let call = OpenCall {
+            counted: RpcCall::begin(method_of(path)),
+            is_open: is_open(path),
+            record: Arc::new(CallRecord::begin(&request)),
+            refusals: self.refusals.clone(),
+            sent_bytes: 0,
+        };
+        request.extensions_mut().insert(call.record.clone());
         let answer = self.inner.call(request);
         Box::pin(async move {
             let answer = answer.await?;
             // An error without a message has its status in the headers.
-            let call = match code_in(answer.headers()) {
-                Some(code) => {
-                    call.finish(code);
+            let call = match Status::from_header_map(answer.headers()) {
+                Some(status) => {
+                    call.end(&status);
                     None
                 }
                 None => Some(call),
@@ -105,10 +210,49 @@ where
     }
 }
 
+/// A call that has not ended. Dropped without a status it is one whose client went away.
+struct OpenCall {
+    counted: RpcCall,
+    /// Health checks: they would be most of the access log.
+    is_open: bool,
+    record: Arc<CallRecord>,
+    refusals: RefusalLog,
+    sent_bytes: u64,
+}
+
+impl OpenCall {
+    fn end(mut self, status: &Status) {
+        self.counted.code = code_name(status.code());
+        self.refusals.tell(status, self.counted.method, &self.record);
+    }
+}
+
+impl Drop for OpenCall {
+    fn drop(&mut self) {
+        if self.is_open {
+            return;
+        }
+        let (record, RpcCall { method, code, begun, .. }) = (&self.record, &self.counted);
+        tracing::info!(
+            target: ACCESS,
+            tenant = record.tenant(),
+            key = record.key(),
+            method,
+            code,
+            seconds = begun.elapsed().as_secs_f64(),
+            received_bytes = record.received_bytes.load(Ordering::Relaxed),
+            sent_bytes = self.sent_bytes,
+            peer = record.peer(),
+            trace = record.trace.as_deref(),
+            "call"
+        );
+    }
+}
+
 /// A body whose trailers, or whose drop, end the call.
 pub struct MeteredBody {
     body: Body,
-    call: Option<RpcCall>,
+    call: Option<OpenCall>,
 }
 
 impl HttpBody for MeteredBody {
@@ -117,16 +261,22 @@ impl HttpBody for MeteredBody {
 
     fn poll_frame(mut self: Pin<&mut Self>, context: &mut Context<'_>) -> Poll<Option<Result<Frame<Bytes>, Status>>> {
         let frame = Pin::new(&mut self.body).poll_frame(context);
-        let code = match &frame {
-            Poll::Ready(Some(Ok(frame))) => frame.trailers_ref().map(|trailers| code_in(trailers).unwrap_or("UNKNOWN")),
-            Poll::Ready(Some(Err(status))) => Some(code_name(status.code())),
-            Poll::Ready(None) => Some("UNKNOWN"),
+        let no_status = || Status::unknown("the answer has no status");
+        let status = match &frame {
+            Poll::Ready(Some(Ok(frame))) => {
+                if let (Some(data), Some(call)) = (frame.data_ref(), &mut self.call) {
+                    call.sent_bytes += data.len() as u64;
+                }
+                frame.trailers_ref().map(|trailers| Status::from_header_map(trailers).unwrap_or_else(no_status))
+            }
+            Poll::Ready(Some(Err(status))) => Some(status.clone()),
+            Poll::Ready(None) => Some(no_status()),
             Poll::Pending => None,
         };
-        if let Some(code) = code
+        if let Some(status) = status
             && let Some(call) = self.call.take()
         {
-            call.finish(code);
+            call.end(&status);
         }
         frame
     }
@@ -138,10 +288,6 @@ impl HttpBody for MeteredBody {
     fn size_hint(&self) -> http_body::SizeHint {
         self.body.size_hint()
     }
-}
-
-fn code_in(headers: &HeaderMap) -> Option<&'static str> {
-    headers.get("grpc-status").map(|value| code_name(Code::from_bytes(value.as_bytes())))
 }
 
 /// The code's name in the gRPC specification.
@@ -174,7 +320,7 @@ mod tests {
 
     use metrics_exporter_prometheus::PrometheusBuilder;
     use prost::Message;
-    use tonic::codegen::http::HeaderValue;
+    use tonic::codegen::http::{HeaderMap, HeaderValue};
 
     use super::*;
     use crate::rpc::proto::FILE_DESCRIPTOR_SET;
@@ -212,7 +358,7 @@ mod tests {
             let request = Request::builder().uri("/scpsfm.v1.JobService/GetJob").body(()).expect("a request");
             let runtime = tokio::runtime::Builder::new_current_thread().build().expect("a runtime");
             runtime.block_on(async {
-                let Ok(answer) = Meter.layer(inner).call(request).await;
+                let Ok(answer) = Meter::default().layer(inner).call(request).await;
                 let mut body = answer.into_body();
                 for _ in 0..read {
                     std::future::poll_fn(|context| Pin::new(&mut body).poll_frame(context)).await;

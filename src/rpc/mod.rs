@@ -17,6 +17,7 @@ pub mod listener;
 pub mod meter;
 mod parts;
 pub mod proto;
+pub mod rates;
 pub mod reload;
 pub mod server;
 pub mod status;

@@ -4,6 +4,7 @@ use std::net::SocketAddr;
 use std::sync::Arc;
 use std::time::Duration;
 
+use governor::clock::DefaultClock;
 use tokio::net::TcpListener;
 use tokio::sync::{Mutex, watch};
 use tokio::task::{JoinError, JoinHandle};
@@ -27,12 +28,13 @@ use super::inputs::{self, Inputs};
 use super::jobs::Jobs;
 use super::keys::{self, KeyRing};
 use super::listener::{self, Introduction};
-use super::meter::{Meter, Metered};
+use super::meter::{Meter, Metered, RefusalLog};
 use super::proto::FILE_DESCRIPTOR_SET;
 use super::proto::admin_service_server::AdminServiceServer;
 use super::proto::calibration_service_server::CalibrationServiceServer;
 use super::proto::input_service_server::InputServiceServer;
 use super::proto::job_service_server::JobServiceServer;
+use super::rates::{self, Rates};
 use super::reload::{self, Current};
 use super::tls;
 use crate::domain::Limits;
@@ -73,6 +75,8 @@ pub struct Options {
     pub tls: Option<tls::Files>,
     /// Where none are, nobody needs one.
     pub keys: keys::Sources,
+    /// How often a key may call and a tenant create jobs.
+    pub rates: rates::Options,
     /// How often the files of certificates and keys are looked at.
     pub look_every: Duration,
     /// How long a connection may take to shake hands and to say its first words.
@@ -131,6 +135,7 @@ impl Default for Options {
             solve_grace: Self::SOLVE_GRACE,
             tls: None,
             keys: keys::Sources::default(),
+            rates: rates::Options::default(),
             look_every: reload::LOOK_EVERY,
             handshake_timeout: listener::HANDSHAKE_TIMEOUT,
             max_silent_connections: listener::MAX_HANDSHAKING,
@@ -164,6 +169,7 @@ pub enum Error {
 #[derive(Debug)]
 pub struct Server {
     address: SocketAddr,
+    key_count: Option<usize>,
     gateway: Gateway,
     health: Arc<Health>,
     /// Follows the store; ended with the server.
@@ -180,7 +186,11 @@ impl Server {
     pub async fn bind(options: Options, engine: Engine) -> Result<Self, Error> {
         // First: an address that is bound takes connections.
         let certificates = certificates(&options).await?;
-        let authenticate = Authenticate::new(keys(&options).await?);
+        let keys = keys(&options).await?;
+        let key_count = keys.as_ref().map(|keys| keys.borrow().len());
+        let meter = Meter::default();
+        let rates = Arc::new(Rates::new(options.rates, DefaultClock::default()));
+        let authenticate = Authenticate::new(keys, rates);
         let budget = Budget::new(options.max_inflight_bytes);
         let listen_error = |source| Error::Listen { address: options.listen, source };
         let listener = TcpListener::bind(options.listen).await.map_err(listen_error)?;
@@ -200,7 +210,7 @@ impl Server {
         };
         let gateway = Gateway {
             service: tower::ServiceBuilder::new()
-                .layer(Meter)
+                .layer(meter.clone())
                 .layer(Explain)
                 .layer(authenticate.clone())
                 .layer(Inflight::new(Arc::clone(&budget)))
@@ -209,19 +219,25 @@ impl Server {
             describes: options.reflection,
             authenticate: authenticate.clone(),
             budget: Arc::clone(&budget),
+            refusals: meter.refusals.clone(),
         };
-        let router = router(&options, services, authenticate, budget).add_service(health_service);
+        let router = router(&options, services, meter, authenticate, budget).add_service(health_service);
         let stop = CancellationToken::new();
         let stopped = stop.clone().cancelled_owned();
         let incoming = listener::incoming(listener, listener_options).into_stream();
         let task = tokio::spawn(router.serve_with_incoming_shutdown(incoming, stopped));
         let follower = tokio::spawn(follow_store(Arc::clone(&health), store));
-        Ok(Self { address, gateway, health, follower, stop, task })
+        Ok(Self { address, key_count, gateway, health, follower, stop, task })
     }
 
     /// Where the server listens.
     pub fn address(&self) -> SocketAddr {
         self.address
+    }
+
+    /// How many keys there were at the start; `None`: nobody needs one.
+    pub fn key_count(&self) -> Option<usize> {
+        self.key_count
     }
 
     /// The API for another port of the same process.
@@ -313,7 +329,13 @@ fn is_of_use(store: StoreState) -> bool {
 /// The certificates, followed as their files change.
 async fn certificates(options: &Options) -> Result<Option<Current<ServerConfig>>, Error> {
     let Some(files) = options.tls.clone() else { return Ok(None) };
-    let load = move || files.load();
+    let load = move || {
+        let config = files.load()?;
+        if let Some(certificate) = files.certificate() {
+            certificate.tell();
+        }
+        Ok(config)
+    };
     let paths = options.tls.iter().flat_map(tls::Files::paths).collect();
     let kept = reload::keep(Reloaded::Certificates, paths, options.look_every, load).await;
     kept.map(Some).map_err(Error::Certificates)
@@ -354,6 +376,7 @@ pub struct Gateway {
     pub describes: bool,
     authenticate: Authenticate,
     budget: Arc<Budget>,
+    refusals: RefusalLog,
 }
 
 impl Gateway {
@@ -363,9 +386,14 @@ impl Gateway {
     /// # Errors
     /// `UNAUTHENTICATED`.
     pub fn check_key(&self, headers: &HeaderMap, introduction: &Introduction) -> Result<(), Status> {
-        self.authenticate.check(headers)?;
+        self.authenticate.check(headers).inspect_err(|status| self.tell_refused(status, introduction))?;
         introduction.make();
         Ok(())
+    }
+
+    /// Writes down that a request was refused before it became a call.
+    pub fn tell_refused(&self, status: &Status, introduction: &Introduction) {
+        self.refusals.tell_early(status, introduction);
     }
 
     /// Whether callers need keys.
@@ -411,9 +439,15 @@ fn services(options: &Options, engine: Engine) -> Result<Routes, Error> {
 }
 
 /// The services behind their layers, as connections reach them.
-fn router(options: &Options, services: Routes, authenticate: Authenticate, budget: Arc<Budget>) -> Router<Layers> {
+fn router(
+    options: &Options,
+    services: Routes,
+    meter: Meter,
+    authenticate: Authenticate,
+    budget: Arc<Budget>,
+) -> Router<Layers> {
     tonic::transport::Server::builder()
-        .layer(Meter)
+        .layer(meter)
         .layer(Explain)
         .layer(authenticate)
         .layer(Inflight::new(budget))

@@ -24,6 +24,7 @@
 //! | `RESOURCE_EXHAUSTED` | `QUEUE_FULL` | admission refused, by the queue's bound of `metadata["bound"]`: `jobs`, `bytes`, `observations`, `tenant_jobs` or `tenant_bytes`; `RetryInfo` says when to come back |
 //! | `INVALID_ARGUMENT` | `BATCH_TOO_LARGE` | the batch alone is more than the queue's bound of `metadata["bound"]` ever allows, named as for `QUEUE_FULL`; `metadata` has `key`, `asked` and `max` too |
 //! | `RESOURCE_EXHAUSTED` | `MEMORY` | the calls under way hold as many bytes as they may together; `RetryInfo`. Nothing was stored but the chunks of an upload |
+//! | `RESOURCE_EXHAUSTED` | `RATE_LIMITED` | more calls of the key, or more new jobs of the tenant, than the rate of `metadata["key"]` allows; `RetryInfo` says after what time this one would pass |
 //! | `RESOURCE_EXHAUSTED` | `STORE_FULL` | the server's disk is full and nothing was stored; `RetryInfo`. What was acknowledged before is there |
 //! | `FAILED_PRECONDITION` | `JOB_NOT_ENDED` | a job that waits or runs is not deleted; cancel it first |
 //! | `FAILED_PRECONDITION` | `JOB_SUCCEEDED` | a job that has succeeded is not retried |
@@ -49,6 +50,7 @@ use super::keys::Scope;
 use crate::domain::job::{JobName, JobState};
 use crate::domain::{InputName, InvalidInput, Oversize, Sha256Digest, Violation};
 use crate::engine::{self, TakenId};
+use crate::telemetry::metrics::RateBound;
 
 /// Domain of every `ErrorInfo`.
 pub const DOMAIN: &str = "scpsfm";
@@ -209,6 +211,14 @@ pub fn hash_mismatch(told: [u8; 32], found: [u8; 32]) -> Status {
 pub fn memory_full(max_bytes: u64) -> Status {
     let message = format!("the calls under way hold the {max_bytes} bytes that they may hold together; come back soon");
     status(Code::ResourceExhausted, "MEMORY", message, ErrorDetails::with_retry_info(Some(MEMORY_RETRY)))
+}
+
+/// Too many calls of a key, or jobs of a tenant, for their rate; `wait`: after which this one would pass.
+pub fn rate_limited(bound: RateBound, wait: Duration) -> Status {
+    let (name, key) = (bound.name(), bound.key());
+    let message = format!("more {name} than {key} allows; come back in {:.3} s", wait.as_secs_f64());
+    let metadata = HashMap::from([("bound".to_owned(), name.to_owned()), ("key".to_owned(), key.to_owned())]);
+    status_with(Code::ResourceExhausted, "RATE_LIMITED", metadata, message, ErrorDetails::with_retry_info(Some(wait)))
 }
 
 /// The messages of a `Solve` or of an upload stopped coming.

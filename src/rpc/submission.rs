@@ -134,19 +134,26 @@ impl Submission {
     }
 }
 
-/// Has jobs stored. In a task of its own, which holds what they take until they are, or are refused: a call that is
-/// dropped meanwhile ends neither.
+/// Has jobs stored, and writes it into the audit log. In a task of its own, which holds what they take until they are,
+/// or are refused: a call that is dropped meanwhile ends neither.
 ///
 /// # Errors
 /// As [`Engine::submit_batch`].
-pub async fn store(engine: &Engine, news: Vec<NewJob>, permit: Permit) -> Result<Vec<Job>, Status> {
-    let engine = engine.clone();
+pub async fn store(
+    caller: &Caller,
+    method: &'static str,
+    engine: &Engine,
+    news: Vec<NewJob>,
+    permit: Permit,
+) -> Result<Vec<Job>, Status> {
+    let (caller, engine) = (caller.clone(), engine.clone());
     let storing = async move {
         let _permit = permit;
-        engine.submit_batch(news).await
+        let stored = engine.submit_batch(news).await.map_err(status::from_engine);
+        caller.audit_jobs(method, stored.as_deref());
+        stored
     };
-    let stored = tokio::spawn(storing.in_current_span()).await;
-    stored.map_err(|error| status::internal(&error))?.map_err(status::from_engine)
+    tokio::spawn(storing.in_current_span()).await.map_err(|error| status::internal(&error))?
 }
 
 fn invalid(error: &InvalidInput) -> Status {

@@ -30,7 +30,7 @@ pub use input_query::{InputPage, InputQuery};
 pub use query::{JobPage, JobQuery, Order};
 pub use record::{
     Bound, CancelReply, Claimed, Created, EncodedResult, Ending, Heartbeat, JobInput, Lease, Load, NewRecord, Outcome,
-    QueueBounds, QueueReport, Request, RetryReply, Swept, TenantQueue, WebhookOutcome, WebhookQueue, Work,
+    QueueBounds, QueueReport, Request, RetryReply, StoreStats, Swept, TenantQueue, WebhookOutcome, WebhookQueue, Work,
 };
 pub use upload::{
     BegunUpload, NewInput, NewUpload, PurgedUploads, StoredInput, UploadBound, UploadBounds, UploadLease, UploadStatus,
@@ -374,6 +374,9 @@ pub trait Store: Send + Sync + 'static {
     /// Notes what the attempt at the delivery of a `claimed` job came to. `false` where the job is gone, or another
     /// attempt has begun since: nothing is noted then.
     async fn settle_webhook(&self, claimed: &Job, outcome: &WebhookOutcome, now: SystemTime) -> Result<bool, Error>;
+
+    /// What operators watch.
+    async fn stats(&self) -> Result<StoreStats, Error>;
 
     /// Whether other processes may be at work on the same jobs.
     fn is_shared(&self) -> bool;

@@ -212,6 +212,17 @@ pub struct Load {
     pub paused: bool,
 }
 
+/// What operators watch; it takes longer to count than [`Load`].
+#[derive(Debug, Clone, Default, PartialEq, Eq)]
+pub struct StoreStats {
+    /// Bytes that the store takes.
+    pub bytes: u64,
+    /// When the job that waits longest entered the queue; `None`: none waits.
+    pub oldest_queue_time: Option<SystemTime>,
+    /// The tenants that have jobs which wait or run.
+    pub tenants: Vec<TenantQueue>,
+}
+
 impl Load {
     /// One more job waits.
     pub fn add(&mut self, new: &NewRecord) {

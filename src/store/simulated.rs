@@ -207,6 +207,12 @@ impl<const SHARED: bool> Database for Simulated<SHARED> {
         Ok(())
     }
 
+    async fn bytes(&self) -> Result<u64, Error> {
+        let select = "SELECT page_count * page_size AS bytes FROM pragma_page_count(), pragma_page_size()";
+        let row = self.reader(Size::Small).await?.row(Statement::new(select)).await?;
+        Ok(u64::try_from(row.integer("bytes")?).unwrap_or(0))
+    }
+
     fn has_room(&self) -> bool {
         !self.locked().faults.full
     }

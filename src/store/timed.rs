@@ -6,7 +6,8 @@ use std::time::{Duration, SystemTime};
 use super::{
     BegunUpload, CancelReply, Claimed, Created, EncodedResult, Ending, Error, Heartbeat, Hint, InputPage, InputQuery,
     JobPage, JobQuery, Lease, Load, NewInput, NewRecord, NewUpload, PurgedUploads, QueueBounds, QueueReport,
-    RetryReply, Store, StoredInput, Swept, UploadBounds, UploadLease, UploadStatus, WebhookOutcome, WebhookQueue, Work,
+    RetryReply, Store, StoreStats, StoredInput, Swept, UploadBounds, UploadLease, UploadStatus, WebhookOutcome,
+    WebhookQueue, Work,
 };
 use crate::domain::InputName;
 use crate::domain::job::{Job, JobEvent, JobName};
@@ -259,6 +260,11 @@ impl<S: Store> Store for Timed<S> {
     async fn settle_webhook(&self, claimed: &Job, outcome: &WebhookOutcome, now: SystemTime) -> Result<bool, Error> {
         let _timer = store_operation("settle_webhook");
         self.0.settle_webhook(claimed, outcome, now).await
+    }
+
+    async fn stats(&self) -> Result<StoreStats, Error> {
+        let _timer = store_operation("stats");
+        self.0.stats().await
     }
 
     fn is_shared(&self) -> bool {

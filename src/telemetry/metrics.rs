@@ -6,9 +6,11 @@
 mod catalogue;
 mod guards;
 mod labels;
+mod process;
+mod tenants;
 
 use std::sync::OnceLock;
-use std::time::Duration;
+use std::time::{Duration, SystemTime};
 
 use metrics::{counter, gauge, histogram};
 use metrics_exporter_prometheus::{BuildError, Matcher, PrometheusBuilder, PrometheusHandle, PrometheusRecorder};
@@ -18,8 +20,11 @@ use crate::domain::{Grade, Proposal, Stage};
 
 pub use catalogue::*;
 pub use guards::{Held, RpcCall, StoreTimer};
-pub use labels::{AttemptLost, Deletion, GivenUp, HttpRefusal, Refusal, Reloaded, UploadRefusal, WebhookAttempt};
+pub use labels::{
+    AttemptLost, Deletion, GivenUp, HttpRefusal, RateBound, Refusal, Reloaded, UploadRefusal, WebhookAttempt,
+};
 use labels::{NONE, grade_name};
+pub use tenants::tenant_jobs;
 
 /// Installs the process-wide recorder, once; later calls return the same handle.
 ///
@@ -38,6 +43,18 @@ pub fn install() -> Result<PrometheusHandle, InstallError> {
             Ok(handle)
         })
         .clone()
+}
+
+/// The page that is scraped, as of now.
+pub fn page(recorder: &PrometheusHandle) -> String {
+    if let Some(usage) = process::Usage::read() {
+        gauge!(PROCESS_MEMORY.name).set(usage.memory_bytes as f64);
+        counter!(PROCESS_CPU.name).absolute(usage.cpu_seconds);
+        gauge!(PROCESS_FILES.name).set(usage.open_files as f64);
+    }
+    let mut page = recorder.render();
+    page.push_str(&tenants::page());
+    page
 }
 
 /// The recorder could not be installed.
@@ -169,7 +186,7 @@ pub fn jobs_deleted(reason: Deletion, count: u32) {
     counter!(JOBS_DELETED.name, "reason" => reason.name()).increment(u64::from(count));
 }
 
-/// A job was refused, or, for want of memory, a call of any kind.
+/// A job was refused, or, for want of memory or by its rate, a call of any kind.
 pub fn refused(refusal: Refusal) {
     counter!(REFUSALS.name, "reason" => refusal.reason(), "bound" => refusal.bound()).increment(1);
 }
@@ -273,6 +290,21 @@ pub fn inflight_bytes(bytes: u64) {
 /// Tells how many bytes calls may hold together; once, at the start of the server.
 pub fn inflight_capacity(bytes: u64) {
     gauge!(INFLIGHT_CAPACITY.name).set(bytes as f64);
+}
+
+/// Tells how long the oldest waiting job has waited.
+pub fn queue_oldest(age: Duration) {
+    gauge!(QUEUE_OLDEST.name).set(age.as_secs_f64());
+}
+
+/// Tells how many bytes the store takes.
+pub fn store_bytes(bytes: u64) {
+    gauge!(STORE_BYTES.name).set(bytes as f64);
+}
+
+/// Tells when the server's certificate expires.
+pub fn certificate_end(end: SystemTime) {
+    gauge!(CERTIFICATE_END.name).set(end.duration_since(SystemTime::UNIX_EPOCH).unwrap_or_default().as_secs_f64());
 }
 
 /// Tells whether files that changed cannot be used.

@@ -7,6 +7,7 @@ pub mod attempt;
 pub mod metrics;
 pub mod server;
 pub mod silence;
+pub mod throttle;
 pub mod tracing;
 
 pub use attempt::{Attempt, waited};

@@ -14,6 +14,7 @@ use tokio::net::TcpListener;
 use tokio::task::JoinHandle;
 use tokio_util::sync::CancellationToken;
 
+use super::metrics::page;
 use super::silence::Bounded;
 
 /// Prometheus' text format, as its exposition documentation names it.
@@ -133,7 +134,7 @@ impl Drop for Server {
 
 fn router(scrape: PrometheusHandle, ready: Readiness) -> Router {
     Router::new()
-        .route("/metrics", get(move || async move { ([(header::CONTENT_TYPE, TEXT_FORMAT)], scrape.render()) }))
+        .route("/metrics", get(move || async move { ([(header::CONTENT_TYPE, TEXT_FORMAT)], page(&scrape)) }))
         .route("/healthz", get(|| async { "ok\n" }))
         .route("/readyz", get(move || async move { ready.answer() }))
 }

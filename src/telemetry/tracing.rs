@@ -14,7 +14,8 @@ use std::time::SystemTime;
 use opentelemetry::propagation::TextMapPropagator;
 use opentelemetry::trace::{Span as _, SpanKind, TraceContextExt, Tracer, TracerProvider};
 use opentelemetry::{Context, KeyValue, global};
-use opentelemetry_otlp::{SpanExporter, WithExportConfig};
+use opentelemetry_otlp::tonic_types::transport::ClientTlsConfig;
+use opentelemetry_otlp::{SpanExporter, WithExportConfig, WithTonicConfig};
 use opentelemetry_sdk::Resource;
 use opentelemetry_sdk::propagation::TraceContextPropagator;
 use opentelemetry_sdk::trace::SdkTracerProvider;
@@ -33,6 +34,12 @@ use crate::domain::job::JobName;
 /// transport would feed the exporter its own calls.
 const SCOPE: &str = "scpsfm";
 
+/// Target of the access log: one line a call.
+pub const ACCESS: &str = "scpsfm::access";
+
+/// Target of the audit log: who created, cancelled, deleted or uploaded what. Always written.
+pub const AUDIT: &str = "scpsfm::audit";
+
 /// How log lines are written.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
@@ -50,7 +57,9 @@ pub struct Options<'a> {
     pub format: Format,
     /// `tracing-subscriber`'s filter syntax: `info`, `info,scpsfm::engine=debug`.
     pub filter: &'a str,
-    /// OTLP collector (gRPC), e.g. `http://127.0.0.1:4317`; `None` exports nothing.
+    /// Whether the access log is written.
+    pub access: bool,
+    /// OTLP collector (gRPC), e.g. `http://127.0.0.1:4317`, or `https://`; `None` exports nothing.
     pub otlp_endpoint: Option<&'a str>,
     /// `service.name` of the traces.
     pub service_name: &'static str,
@@ -114,7 +123,11 @@ where
             .with_tracer(provider.tracer(SCOPE))
             .with_filter(Targets::new().with_target(SCOPE, LevelFilter::INFO))
     });
-    let subscriber = Registry::default().with(export).with(lines.with_filter(EnvFilter::try_new(options.filter)?));
+    let access = if options.access { LevelFilter::INFO } else { LevelFilter::OFF };
+    let filter = EnvFilter::try_new(options.filter)?
+        .add_directive(format!("{ACCESS}={access}").parse()?)
+        .add_directive(format!("{AUDIT}=info").parse()?);
+    let subscriber = Registry::default().with(export).with(lines.with_filter(filter));
     Ok((subscriber, Guard { provider }))
 }
 
@@ -122,7 +135,12 @@ fn provider(endpoint: &str, service_name: &'static str) -> Result<SdkTracerProvi
     if tokio::runtime::Handle::try_current().is_err() {
         return Err(Error::NoRuntime);
     }
-    let exporter = SpanExporter::builder().with_tonic().with_endpoint(endpoint).build()?;
+    let exporter = SpanExporter::builder().with_tonic().with_endpoint(endpoint);
+    let exporter = match endpoint.starts_with("https:") {
+        true => exporter.with_tls_config(ClientTlsConfig::new().with_native_roots()),
+        false => exporter,
+    };
+    let exporter = exporter.build()?;
     let resource = Resource::builder()
         .with_service_name(service_name)
         .with_attribute(KeyValue::new("service.version", env!("CARGO_PKG_VERSION")))

@@ -19,7 +19,7 @@ const OPS: &str = "ops-0123456789abcdef0123456789abcdef";
 
 pub struct Answer {
     pub code: u16,
-    head: String,
+    pub head: String,
     pub body: Vec<u8>,
 }
 
@@ -33,7 +33,7 @@ impl Answer {
         String::from_utf8(self.body.clone()).expect("text")
     }
 
-    fn has(&self, header: &str) -> bool {
+    pub fn has(&self, header: &str) -> bool {
         self.head.to_ascii_lowercase().contains(&format!("\r\n{header}"))
     }
 

@@ -21,6 +21,7 @@ mod lost;
 mod matches;
 mod observations;
 mod prior;
+mod rates;
 mod readme;
 mod real;
 mod replicas;

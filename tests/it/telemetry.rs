@@ -5,13 +5,19 @@ use std::path::Path;
 use std::process::Stdio;
 use std::time::Duration;
 
+use opentelemetry_proto::tonic::collector::trace::v1::trace_service_server::TraceServiceServer;
 use rustix::process::Signal;
 use scpsfm::domain::Stage;
+use scpsfm::rpc::proto::job_service_client::JobServiceClient;
 use scpsfm::rpc::proto::{self, JobState, create_job_request::Source};
 use tonic::Code;
+use tonic::transport::{Channel, Identity, ServerTlsConfig};
 
+use crate::http::request;
+use crate::support::certificates::Authority;
 use crate::support::collector::{Collector, attribute, hex, only};
-use crate::support::live::{connected, created, easy, lasting, reaches};
+use crate::support::keys::{NORTH, SOUTH, keyed};
+use crate::support::live::{connected, created, easy, lasting, reaches, small};
 use crate::support::program::Serving;
 use crate::support::scrape::Page;
 use crate::support::server::soon;
@@ -213,11 +219,15 @@ async fn a_job_is_one_trace_under_its_callers_and_every_line_of_it_bears_its_nam
 
     let serving = logged(&log, "serving");
     assert_eq!((&serving["version"], &serving["recovered_jobs"]), (&env!("CARGO_PKG_VERSION").into(), &0.into()));
+    assert_eq!((&serving["store_kind"], &serving["queued_jobs"]), (&"sqlite".into(), &0.into()));
+    assert!(serving["keys"].is_null() && serving["certificate_end"].is_null(), "{serving}");
     assert_eq!(serving["store"], data_dir.display().to_string());
     assert_eq!(format!("http://{}", serving["grpc"].as_str().expect("an address")), server.grpc);
     assert_eq!(serving["metrics"], server.metrics);
     let ended = logged(&log, "job ended");
     assert!(ended["state"] == "SUCCEEDED" && ended["grade"].is_string() && ended["seconds"].is_f64(), "{ended}");
+    assert_eq!((&ended["tenant"], &ended["attempt"]), (&"default".into(), &1.into()), "{ended}");
+    assert!(ended["focal_px"].is_f64() || ended["grade"] == "PROJECTIVE_ONLY", "{ended}");
     let log = std::fs::read_to_string(&log).expect("a log");
     let lines = log.lines().map(|line| serde_json::from_str::<serde_json::Value>(line).expect("JSON"));
     let of_attempt: Vec<_> = lines.filter(|line| line["target"] == "scpsfm::engine::execution").collect();
@@ -225,4 +235,177 @@ async fn a_job_is_one_trace_under_its_callers_and_every_line_of_it_bears_its_nam
     for line in of_attempt {
         assert_eq!(line["span"]["job"], name.as_str(), "{line}");
     }
+}
+
+/// What a log in JSON holds so far; its last line may be on its way.
+fn lines_so_far(log: &Path) -> Vec<serde_json::Value> {
+    let log = std::fs::read_to_string(log).expect("a log");
+    log.lines().filter_map(|line| serde_json::from_str(line).ok()).collect()
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn operators_see_every_call_who_changed_what_and_who_was_refused() {
+    const TRACE_ID: &str = "4bf92f3577b34da6a3ce929d0e0e4736";
+    const WRONG_CALLS: usize = 30;
+    let directory = tempfile::tempdir().expect("a temporary directory");
+    let log = directory.path().join("log");
+    let keys = format!("north:{NORTH}");
+    // The filter is for everything else.
+    let variables =
+        [("SCPSFM_AUTH__KEYS", keys.as_str()), ("SCPSFM_LOG__ACCESS", "true"), ("SCPSFM_LOG__FILTER", "warn")];
+    let data_dir = directory.path().join("data");
+    let server = Serving::start_with(&data_dir, &variables, File::create(&log).expect("a log file"));
+    let channel = Channel::from_shared(server.grpc.clone()).expect("an address").connect().await.expect("a connection");
+    let mut jobs = JobServiceClient::new(keyed(&channel, NORTH));
+    let mut create = tonic::Request::new(small(1));
+    let traceparent = format!("00-{TRACE_ID}-00f067aa0ba902b7-01");
+    create.metadata_mut().insert("traceparent", traceparent.parse().expect("ASCII"));
+    let name = jobs.create_job(create).await.expect("a job").into_inner().name;
+    let get = proto::GetJobRequest { name: name.clone() };
+    jobs.get_job(get).await.expect("a job");
+    let bearer = format!("Bearer {NORTH}");
+    let path = format!("/v1/{name}");
+    let read = tokio::task::block_in_place(|| request(&server, "GET", &path, &[("authorization", &bearer)], &[]));
+    assert_eq!(read.code, 200);
+    jobs.cancel_job(proto::CancelJobRequest { name: name.clone(), ..Default::default() }).await.expect("a cancel");
+    let none = "tenants/north/jobs/none";
+    let delete = proto::DeleteJobRequest { name: none.into(), ..Default::default() };
+    assert_eq!(jobs.delete_job(delete).await.expect_err("no job").code(), Code::NotFound);
+    let mut wrong = JobServiceClient::new(keyed(&channel, SOUTH));
+    for _ in 0..WRONG_CALLS {
+        let refused = wrong.list_jobs(proto::ListJobsRequest::default()).await.expect_err("a wrong key");
+        assert_eq!(refused.code(), Code::Unauthenticated);
+    }
+    // The HTTP port refuses it before it becomes a call; here the missing key.
+    let keyless = tokio::task::block_in_place(|| request(&server, "GET", &path, &[], &[]));
+    assert_eq!(keyless.code, 401);
+
+    let of = |lines: &[serde_json::Value], target: &str, method: &str| -> Vec<serde_json::Value> {
+        lines
+            .iter()
+            .filter(|line| {
+                line["target"] == target && line["method"].as_str().is_some_and(|name| name.ends_with(method))
+            })
+            .cloned()
+            .collect()
+    };
+    // A call's line comes with the last byte of its answer, which may be a moment after its client has it.
+    let lines = soon(async {
+        loop {
+            let lines = lines_so_far(&log);
+            if of(&lines, "scpsfm::access", "/ListJobs").len() == WRONG_CALLS
+                && of(&lines, "scpsfm::access", "/GetJob").len() >= 2
+            {
+                return lines;
+            }
+            tokio::time::sleep(Duration::from_millis(20)).await;
+        }
+    })
+    .await;
+    let fingerprint = scpsfm::rpc::keys::Hash::of(NORTH).fingerprint();
+    let is_known = |line: &serde_json::Value| {
+        let peer = line["peer"].as_str().unwrap_or_default();
+        line["tenant"] == "north" && line["key"] == fingerprint.as_str() && peer.starts_with("127.0.0.1:")
+    };
+    let created = of(&lines, "scpsfm::access", "/CreateJob");
+    let [created] = &created[..] else { panic!("not one line: {created:?}") };
+    assert!(is_known(created) && created["code"] == "OK" && created["trace"] == TRACE_ID, "{created}");
+    assert!(created["seconds"].is_f64(), "{created}");
+    assert!(created["received_bytes"].as_u64() > Some(100) && created["sent_bytes"].as_u64() > Some(10), "{created}");
+    let read = of(&lines, "scpsfm::access", "/GetJob");
+    assert_eq!(read.len(), 2, "one over gRPC and one over HTTP: {read:?}");
+    assert!(read.iter().all(is_known), "{read:?}");
+
+    for (method, resource, code) in
+        [("CreateJob", name.as_str(), "OK"), ("CancelJob", &name, "OK"), ("DeleteJob", none, "NOT_FOUND")]
+    {
+        let audit = of(&lines, "scpsfm::audit", method);
+        let [audit] = &audit[..] else { panic!("not one line of {method}: {audit:?}") };
+        assert!(is_known(audit) && audit["resource"] == resource && audit["code"] == code, "{audit}");
+    }
+
+    let refused: Vec<_> = lines.iter().filter(|line| line["message"] == "refused").collect();
+    // Ten a minute, and the test may be slow.
+    assert!(refused.len() >= 10 && refused.len() < WRONG_CALLS, "{refused:?}");
+    assert!(refused.iter().all(|line| line["code"] == "UNAUTHENTICATED" && line["level"] == "WARN"), "{refused:?}");
+    assert!(refused.iter().any(|line| line["reason"] == "API_KEY_UNKNOWN"), "{refused:?}");
+    assert!(lines.iter().all(|line| line["message"] != "serving"), "the filter lets no other line through");
+    let text = std::fs::read_to_string(&log).expect("a log");
+    assert!(!text.contains(NORTH) && !text.contains(SOUTH), "a key stands in the log");
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn the_page_tells_of_the_process_the_store_and_each_tenants_jobs() {
+    let directory = tempfile::tempdir().expect("a temporary directory");
+    let server = Serving::start(&directory.path().join("data"));
+    let mut jobs = connected(&server).await;
+    let running = created(&mut jobs, lasting(ENDLESS)).await;
+    reaches(&mut jobs, &running, &[JobState::Running]).await;
+    let waiting = created(&mut jobs, lasting(ENDLESS)).await;
+    let [of_running, of_waiting] =
+        ["RUNNING", "QUEUED"].map(|state| format!("scpsfm_tenant_jobs{{tenant=\"default\",state=\"{state}\"}}"));
+    let page = scrape_until(&server, |page| {
+        page.value_so_far(&of_waiting) == 1.0 && page.value("scpsfm_queue_oldest_seconds") > 0.0
+    })
+    .await;
+    assert_eq!(page.value(&of_running), 1.0);
+    assert_eq!(page.value("scpsfm_tenant_jobs{tenant=\"OTHER\",state=\"QUEUED\"}"), 0.0);
+    assert!(page.value("scpsfm_store_bytes") > 10_000.0);
+    assert_eq!(page.value("scpsfm_certificate_end_timestamp_seconds"), 0.0, "no TLS");
+    let text = server.page("/metrics");
+    let of_process = |name: &str| -> f64 {
+        let value = text.lines().find_map(|line| line.strip_prefix(name)?.strip_prefix(' '));
+        value.unwrap_or_else(|| panic!("no {name} in\n{text}")).parse().expect("a number")
+    };
+    assert!(of_process("process_resident_memory_bytes") > 1e6 && of_process("process_open_fds") > 5.0);
+    assert!(of_process("process_cpu_seconds_total") >= 0.0);
+    for name in [waiting, running] {
+        jobs.cancel_job(proto::CancelJobRequest { name, ..Default::default() }).await.expect("a cancel");
+    }
+    scrape_until(&server, |page| page.value_so_far(&of_running) + page.value_so_far(&of_waiting) == 0.0).await;
+}
+
+#[test]
+fn a_certificate_that_clients_will_refuse_is_a_warning_at_the_start() {
+    let directory = tempfile::tempdir().expect("a temporary directory");
+    let at = directory.path();
+    let nameless = Authority::new("ours").issue(at, "nameless", &[]);
+    let log = at.join("log");
+    let [certificate, key] = [&nameless.certificate, &nameless.key].map(|path| path.to_str().expect("UTF-8"));
+    let arguments = ["--workers", "1", "--tls-certificate", certificate, "--tls-key", key];
+    let server = Serving::start_more(&at.join("data"), &arguments, &[], File::create(&log).expect("a log file"));
+    let warning = logged(&log, "clients will refuse the server's certificate (tls.certificate)");
+    assert_eq!(
+        (&warning["level"], &warning["problem"]),
+        (&"WARN".into(), &"it has no subject alternative name".into())
+    );
+    assert_eq!(logged(&log, "serving")["certificate_end"], "4096-01-01T00:00:00Z");
+    assert!(scrape(&server).value("scpsfm_certificate_end_timestamp_seconds") > 4e9);
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn traces_go_to_a_collector_over_tls() {
+    let directory = tempfile::tempdir().expect("a temporary directory");
+    let at = directory.path();
+    let authority = Authority::new("ours");
+    let (trusted, here) = (authority.write(at, "ours.pem"), authority.issue(at, "here", &["127.0.0.1"]));
+    let read = |path: &Path| std::fs::read_to_string(path).expect("a file");
+    let identity = Identity::from_pem(read(&here.certificate), read(&here.key));
+    let listener = tokio::net::TcpListener::bind("127.0.0.1:0").await.expect("bind");
+    let endpoint = format!("https://{}", listener.local_addr().expect("an address"));
+    let collector = Collector::default();
+    let collecting = tonic::transport::Server::builder()
+        .tls_config(ServerTlsConfig::new().identity(identity))
+        .expect("a certificate")
+        .add_service(TraceServiceServer::new(collector.clone()))
+        .serve_with_incoming(tokio_stream::wrappers::TcpListenerStream::new(listener));
+    tokio::spawn(collecting);
+    let export = [("SCPSFM_OTLP__ENDPOINT", endpoint.as_str()), ("SSL_CERT_FILE", trusted.to_str().expect("UTF-8"))];
+    let mut server = Serving::start_with(&at.join("data"), &export, Stdio::null());
+    let mut jobs = connected(&server).await;
+    let name = created(&mut jobs, small(1)).await;
+    reaches(&mut jobs, &name, &[JobState::Succeeded, JobState::Failed]).await;
+    server.running.signal(Signal::TERM);
+    assert!(tokio::task::block_in_place(|| server.running.wait()).success());
+    assert_eq!(attribute(only(&collector.spans(), "submit"), "job"), Some(name));
 }

@@ -31,6 +31,7 @@ __all__ = [
     "NotFound",
     "PermissionDenied",
     "QueueFull",
+    "RateLimited",
     "ResourceExhausted",
     "ScpsfmError",
     "StoreFull",
@@ -152,6 +153,10 @@ class MemoryFull(ResourceExhausted):
     """The calls under way hold as many bytes as they may together."""
 
 
+class RateLimited(ResourceExhausted):
+    """The key calls, or the tenant creates jobs, more often than it may; after `retry_after` the call would pass."""
+
+
 class StoreFull(ResourceExhausted):
     """The server's disk is full. Nothing was stored."""
 
@@ -214,6 +219,7 @@ class JobDeadlineExceeded(JobError, TimeoutError):
 _BY_REASON: dict[str, type[ScpsfmError]] = {
     "QUEUE_FULL": QueueFull,
     "MEMORY": MemoryFull,
+    "RATE_LIMITED": RateLimited,
     "STORE_FULL": StoreFull,
     "UPLOADS_FULL": UploadsFull,
 }

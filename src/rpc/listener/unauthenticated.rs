@@ -1,6 +1,7 @@
 //! Connections of which nobody knows yet whether anyone who may call is behind them: how long they keep their place.
 
 use std::io;
+use std::net::SocketAddr;
 use std::pin::Pin;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
@@ -15,19 +16,28 @@ use crate::telemetry::metrics;
 /// minute is one that reads a large input in between, on a machine that is busy.
 pub const AUTH_TIMEOUT: Duration = Duration::from_secs(30);
 
-/// Whether someone who may call has called over a connection. Goes with each of its requests; clones are the same one.
+/// Whether someone who may call has called over a connection, and from where. Goes with each of its requests; clones
+/// are the same one.
 #[derive(Debug, Clone, Default)]
-pub struct Introduction(Arc<AtomicBool>);
+pub struct Introduction {
+    made: Arc<AtomicBool>,
+    peer: Option<SocketAddr>,
+}
 
 impl Introduction {
     /// Someone who may call has.
     pub fn make(&self) {
         // Nothing else is read by it.
-        self.0.store(true, Ordering::Relaxed);
+        self.made.store(true, Ordering::Relaxed);
     }
 
     fn is_made(&self) -> bool {
-        self.0.load(Ordering::Relaxed)
+        self.made.load(Ordering::Relaxed)
+    }
+
+    /// The other end of the connection: the client, or the proxy before it.
+    pub fn peer(&self) -> Option<SocketAddr> {
+        self.peer
     }
 }
 
@@ -40,9 +50,9 @@ pub(super) struct AuthDeadline {
 
 impl AuthDeadline {
     /// From now on; `None`: for ever.
-    pub(super) fn begin(bound: Option<Duration>) -> Self {
+    pub(super) fn begin(bound: Option<Duration>, peer: Option<SocketAddr>) -> Self {
         let end = bound.map(|bound| Box::pin(tokio::time::sleep(bound)));
-        Self { introduction: Introduction::default(), end }
+        Self { introduction: Introduction { peer, ..Introduction::default() }, end }
     }
 
     /// Lets the connection go on as long as there is time. Its task is woken when there is none any more.

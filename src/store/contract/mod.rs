@@ -42,6 +42,7 @@ macro_rules! store_contract {
             reading::listings_page_and_filter,
             reading::events_come_in_order_and_in_portions,
             reading::what_does_not_exist_is_not_found,
+            reading::operators_see_tenants_the_oldest_job_and_bytes,
             creation::admission_bounds_each_tenant,
             creation::a_batch_is_stored_whole_or_not_at_all,
             creation::a_batch_knows_its_request_ids,

@@ -80,3 +80,21 @@ pub(in crate::store) async fn what_does_not_exist_is_not_found(store: &dyn Store
     let lease = Lease { name, attempt: 1 };
     assert_eq!(store.heartbeat(&lease, time(0), LEASE).await, Err(Error::Fenced(lease)));
 }
+
+pub(crate) async fn operators_see_tenants_the_oldest_job_and_bytes(store: &dyn Store) {
+    let empty = store.stats().await.expect("counts");
+    assert_eq!((empty.oldest_queue_time, empty.tenants.len()), (None, 0));
+    assert!(empty.bytes > 0, "a schema takes room");
+    let of =
+        |tenant: &str, job: &str| NewRecord { name: JobName { tenant: tenant.into(), job: job.into() }, ..record(job) };
+    create(store, of("north", "a"), 0).await;
+    create(store, of("north", "b"), 1).await;
+    create(store, of("south", "c"), 2).await;
+    let first = claim(store, 3).await;
+    let mut stats = store.stats().await.expect("counts");
+    stats.tenants.sort_by(|a, b| a.tenant.cmp(&b.tenant));
+    let tenants: Vec<_> = stats.tenants.iter().map(|of| (of.tenant.as_str(), of.queued, of.running)).collect();
+    assert_eq!(first.job.name.job, "a");
+    assert_eq!(tenants, [("north", 1, 1), ("south", 1, 0)]);
+    assert_eq!(stats.oldest_queue_time, Some(time(1)), "what runs does not wait");
+}

@@ -191,6 +191,12 @@ impl Database for Postgres {
         self.clock.set(&mut *self.pool.acquire().await?).await
     }
 
+    async fn bytes(&self) -> Result<u64, Error> {
+        let select = Statement::new("SELECT pg_database_size(current_database()) AS bytes");
+        let row = self.reader(Size::Small).await?.row(select).await?;
+        Ok(u64::try_from(sql::Row::integer(&row, "bytes")?).unwrap_or(0))
+    }
+
     async fn heard(&self) -> Hint {
         #[cfg(test)]
         if self.deaf {

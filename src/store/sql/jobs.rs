@@ -7,7 +7,9 @@ use super::rows::{self, integer, micros, number, returning_job, select_jobs};
 use super::{Change, Connection, Row, Statement, uploads, webhooks};
 use crate::domain::job::{EventBody, Job, JobEvent, JobName, JobState};
 use crate::domain::{InputName, Webhook};
-use crate::store::record::{Created, EncodedResult, JobInput, Load, NewRecord, QueueBounds, Request, Work};
+use crate::store::record::{
+    Created, EncodedResult, JobInput, Load, NewRecord, QueueBounds, Request, TenantQueue, Work,
+};
 use crate::store::{Error, JobPage, JobQuery, Order, TakenId, payload};
 
 /// Number of a job's first event, which its row counts.
@@ -414,6 +416,27 @@ pub(super) async fn load<C: Connection>(connection: &mut C) -> Result<Load, Erro
          (SELECT pause_time IS NOT NULL FROM queue) AS paused FROM jobs WHERE state = 'QUEUED'",
     );
     measured(&connection.row(select).await?)
+}
+
+/// What waits and runs of each tenant that has such jobs, and since when the oldest job waits.
+pub(super) async fn by_tenant<C: Connection>(
+    connection: &mut C,
+) -> Result<(Vec<TenantQueue>, Option<SystemTime>), Error> {
+    let select = Statement::new(
+        "SELECT tenant, COUNT(*) FILTER (WHERE state = 'QUEUED') AS queued, \
+         COUNT(*) FILTER (WHERE state = 'RUNNING') AS running, \
+         MIN(queue_time) FILTER (WHERE state = 'QUEUED') AS oldest \
+         FROM jobs WHERE state IN ('QUEUED', 'RUNNING') GROUP BY tenant",
+    );
+    let (mut tenants, mut oldest) = (Vec::new(), None::<SystemTime>);
+    for row in connection.rows(select).await? {
+        let (queued, running) = (number(&row, "queued")?, number(&row, "running")?);
+        tenants.push(TenantQueue { tenant: row.text("tenant")?, queued, running });
+        if let Some(time) = row.optional_integer("oldest")?.map(rows::time) {
+            oldest = Some(oldest.map_or(time, |oldest| oldest.min(time)));
+        }
+    }
+    Ok((tenants, oldest))
 }
 
 /// What waits of one tenant; what runs is not counted.

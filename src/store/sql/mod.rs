@@ -142,6 +142,9 @@ pub(super) trait Database: Send + Sync + 'static {
         async { Ok(()) }
     }
 
+    /// Bytes that the database takes.
+    fn bytes(&self) -> impl Future<Output = Result<u64, Error>> + Send;
+
     /// See [`crate::store::Store::has_room`].
     fn has_room(&self) -> bool {
         true

@@ -12,7 +12,7 @@ use crate::domain::job::{Job, JobEvent, JobName};
 use crate::domain::progress::Progress;
 use crate::store::record::{
     CancelReply, Claimed, Created, EncodedResult, Ending, Heartbeat, JobInput, Lease, Load, NewRecord, Outcome,
-    QueueBounds, QueueReport, RetryReply, Swept, WebhookOutcome, WebhookQueue, Work,
+    QueueBounds, QueueReport, RetryReply, StoreStats, Swept, WebhookOutcome, WebhookQueue, Work,
 };
 use crate::store::upload::{
     BegunUpload, NewInput, NewUpload, PurgedUploads, StoredInput, UploadBounds, UploadLease, UploadStatus,
@@ -347,6 +347,12 @@ impl<D: Database> Store for D {
         writes!(self, Size::Small, Moves::Ends(0), [claimed, outcome], |connection| webhooks::settle(
             connection, &claimed, &outcome, now
         ))
+    }
+
+    async fn stats(&self) -> Result<StoreStats, Error> {
+        let (tenants, oldest_queue_time) = reads!(self, Size::Small, |connection| jobs::by_tenant(connection))?;
+        let bytes = bounded(self, Size::Small, self.bytes()).await?;
+        Ok(StoreStats { bytes, oldest_queue_time, tenants })
     }
 
     fn is_shared(&self) -> bool {

@@ -15,7 +15,7 @@ mod vacuum;
 mod writer;
 
 use std::fs::{File, TryLockError};
-use std::path::Path;
+use std::path::{Path, PathBuf};
 use std::time::Duration;
 
 use sqlx::pool::PoolConnection;
@@ -73,6 +73,8 @@ pub struct Sqlite {
     writer: Writer,
     has_room: Room,
     readers: SqlitePool,
+    /// The database and its write-ahead log.
+    files: [PathBuf; 2],
     /// Unlocked when it is closed, also by the death of the process.
     _lock: File,
 }
@@ -103,9 +105,10 @@ impl Sqlite {
             opened => opened?,
         };
         let has_room = reserve.room();
+        let files = [database.clone(), log_of(&database)];
         let writer = Writer::start(connection, database, reserve, group_time)?;
         let readers = readers().connect_with(options.pragma("query_only", "1")).await?;
-        Ok(Self { writer, has_room, readers, _lock: lock })
+        Ok(Self { writer, has_room, readers, files, _lock: lock })
     }
 
     /// Runs statements as they are on the writer's connection, for tests that need the database to misbehave.
@@ -155,11 +158,16 @@ fn refuse_foreign(connection: &mut WriteConnection) -> Result<(), Error> {
     )))
 }
 
+/// The write-ahead log of a database.
+fn log_of(database: &Path) -> PathBuf {
+    database.with_file_name(format!("{DATABASE_FILE}-wal"))
+}
+
 /// Whether the database's file is there. One of no bytes is refused: no server leaves one behind, so that it is what is
 /// left of jobs, and a store that began anew on it would hide that they are gone. So is none at all beside a log with
 /// commits that only it holds.
 fn is_there(database: &Path) -> Result<bool, Error> {
-    let log = database.with_file_name(format!("{DATABASE_FILE}-wal"));
+    let log = log_of(database);
     match std::fs::metadata(database) {
         Ok(file) if file.len() == 0 => Err(Error::Corrupt(format!(
             "{} has no bytes; restore it, or move it and the files beside it away to begin without jobs",
@@ -256,6 +264,16 @@ impl Database for Sqlite {
 
     fn bound(&self, _size: Size) -> Option<Duration> {
         None
+    }
+
+    /// The file and its log.
+    async fn bytes(&self) -> Result<u64, Error> {
+        let length = |path: &PathBuf| match std::fs::metadata(path) {
+            Ok(file) => Ok(file.len()),
+            Err(error) if error.kind() == std::io::ErrorKind::NotFound => Ok(0),
+            Err(error) => Err(Error::Unavailable(format!("cannot look at {}: {error}", path.display()))),
+        };
+        self.files.iter().map(length).sum()
     }
 
     /// Gives the file's free pages back, some at a time. It becomes shorter as the log is written back, which tells it

@@ -143,7 +143,7 @@ pub const REFUSALS: Metric = Metric {
     name: "scpsfm_admission_refusals_total",
     kind: Kind::Counter,
     labels: &["reason", "bound"],
-    help: "Jobs refused before anything was stored, by reason; of QUEUE_FULL and BATCH_TOO_LARGE, by the bound that was hit. MEMORY counts calls of every kind.",
+    help: "Jobs refused before anything was stored, by reason; of QUEUE_FULL and BATCH_TOO_LARGE, by the bound that was hit. MEMORY and RATE_LIMITED count calls of every kind.",
 };
 pub const UPLOADED_BYTES: Metric = Metric {
     name: "scpsfm_uploaded_bytes_total",
@@ -268,6 +268,48 @@ pub const INFLIGHT_CAPACITY: Metric = Metric {
     labels: &[],
     help: "Bytes that calls may hold together; a call that would hold more is refused.",
 };
+pub const QUEUE_OLDEST: Metric = Metric {
+    name: "scpsfm_queue_oldest_seconds",
+    kind: Kind::Gauge,
+    labels: &[],
+    help: "Seconds that the oldest waiting job has waited; 0 where none waits.",
+};
+pub const TENANT_JOBS: Metric = Metric {
+    name: "scpsfm_tenant_jobs",
+    kind: Kind::Gauge,
+    labels: &["tenant", "state"],
+    help: "Jobs that wait and run, of the 20 tenants that have most; those of all others are one, OTHER.",
+};
+pub const STORE_BYTES: Metric = Metric {
+    name: "scpsfm_store_bytes",
+    kind: Kind::Gauge,
+    labels: &[],
+    help: "Bytes of the store: the embedded database's files, or the PostgreSQL database.",
+};
+pub const CERTIFICATE_END: Metric = Metric {
+    name: "scpsfm_certificate_end_timestamp_seconds",
+    kind: Kind::Gauge,
+    labels: &[],
+    help: "When the server's certificate expires, in seconds since the Unix epoch; 0 without TLS.",
+};
+pub const PROCESS_MEMORY: Metric = Metric {
+    name: "process_resident_memory_bytes",
+    kind: Kind::Gauge,
+    labels: &[],
+    help: "Memory that the process has in use. 0 where the system does not tell.",
+};
+pub const PROCESS_CPU: Metric = Metric {
+    name: "process_cpu_seconds_total",
+    kind: Kind::Counter,
+    labels: &[],
+    help: "Processor time that the process has spent, in whole seconds.",
+};
+pub const PROCESS_FILES: Metric = Metric {
+    name: "process_open_fds",
+    kind: Kind::Gauge,
+    labels: &[],
+    help: "Open file descriptors, connections among them.",
+};
 pub const RELOAD_FAILED: Metric = Metric {
     name: "scpsfm_reload_failed",
     kind: Kind::Gauge,
@@ -324,4 +366,11 @@ pub const ALL: &[Metric] = &[
     INFLIGHT_CAPACITY,
     RELOAD_FAILED,
     LOCKED_OUT,
+    QUEUE_OLDEST,
+    TENANT_JOBS,
+    STORE_BYTES,
+    CERTIFICATE_END,
+    PROCESS_MEMORY,
+    PROCESS_CPU,
+    PROCESS_FILES,
 ];

@@ -27,9 +27,10 @@ impl Drop for Held {
 /// A gRPC call that has begun. Dropping it without a code counts it as `CANCELLED`: the client went away.
 #[must_use = "the call ends when this is dropped"]
 pub struct RpcCall {
-    method: &'static str,
-    begun: Instant,
-    code: &'static str,
+    pub method: &'static str,
+    pub begun: Instant,
+    /// The code that it ends with.
+    pub code: &'static str,
     _in_flight: Held,
 }
 

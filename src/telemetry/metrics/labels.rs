@@ -20,13 +20,45 @@ pub enum Refusal {
     Draining,
     /// The calls under way hold as many bytes as they may.
     Memory,
+    /// A key calls, or a tenant creates jobs, more often than it may.
+    RateLimited(RateBound),
+}
+
+/// What has a rate.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum RateBound {
+    /// Calls of a key.
+    Calls,
+    /// New jobs of a tenant.
+    Jobs,
+}
+
+impl RateBound {
+    const ALL: [RateBound; 2] = [RateBound::Calls, RateBound::Jobs];
+
+    /// Its name to callers and in metrics.
+    pub fn name(self) -> &'static str {
+        match self {
+            RateBound::Calls => "calls",
+            RateBound::Jobs => "jobs",
+        }
+    }
+
+    /// The key of the configuration that sets it.
+    pub fn key(self) -> &'static str {
+        match self {
+            RateBound::Calls => "rates.calls_per_second",
+            RateBound::Jobs => "rates.jobs_per_second",
+        }
+    }
 }
 
 impl Refusal {
     pub(super) fn all() -> impl Iterator<Item = Refusal> {
         let by_bound =
             Quota::OF_QUEUE.into_iter().flat_map(|quota| [Refusal::QueueFull(quota), Refusal::BatchTooLarge(quota)]);
-        by_bound.chain([Refusal::Invalid, Refusal::TooLarge, Refusal::Draining, Refusal::Memory])
+        let by_rate = RateBound::ALL.into_iter().map(Refusal::RateLimited);
+        by_bound.chain(by_rate).chain([Refusal::Invalid, Refusal::TooLarge, Refusal::Draining, Refusal::Memory])
     }
 
     pub(super) fn reason(self) -> &'static str {
@@ -37,13 +69,15 @@ impl Refusal {
             Refusal::TooLarge => "TOO_LARGE",
             Refusal::Draining => "DRAINING",
             Refusal::Memory => "MEMORY",
+            Refusal::RateLimited(_) => "RATE_LIMITED",
         }
     }
 
-    /// The bound of the queue that was hit; `NONE` where it was no bound.
+    /// The bound that was hit; `NONE` where it was none.
     pub(super) fn bound(self) -> &'static str {
         match self {
             Refusal::QueueFull(quota) | Refusal::BatchTooLarge(quota) => quota.name(),
+            Refusal::RateLimited(bound) => bound.name(),
             Refusal::Invalid | Refusal::TooLarge | Refusal::Draining | Refusal::Memory => NONE,
         }
     }

@@ -13,8 +13,10 @@ const RULES: &str = include_str!("../../../deploy/prometheus-rules.yml");
 /// The page after `act`, on a recorder of its own.
 pub(crate) fn page_after(act: impl FnOnce()) -> String {
     let recorder = recorder().expect("recorder");
-    metrics::with_local_recorder(&recorder, act);
-    recorder.handle().render()
+    metrics::with_local_recorder(&recorder, || {
+        act();
+        page(&recorder.handle())
+    })
 }
 
 /// Value of a series, written as it stands on the page.
@@ -70,6 +72,7 @@ fn ended(state: JobState, grade: Option<Grade>) -> Job {
 fn every_metric_is_declared_once_named_by_convention_and_on_the_page() {
     let page = page_after(|| {
         build_info("flex");
+        tenant_jobs(vec![]);
         RpcCall::begin("scpsfm.v1.JobService/GetJob").finish("OK");
         drop(store_operation("claim"));
     });
@@ -114,6 +117,8 @@ fn what_is_known_beforehand_is_zero_before_the_first_job() {
         "scpsfm_jobs_deleted_total{reason=\"RETENTION\"}",
         "scpsfm_http_refused_total{reason=\"HOST_REFUSED\"}",
         "scpsfm_admission_refusals_total{reason=\"DRAINING\",bound=\"NONE\"}",
+        "scpsfm_admission_refusals_total{reason=\"RATE_LIMITED\",bound=\"calls\"}",
+        "scpsfm_admission_refusals_total{reason=\"RATE_LIMITED\",bound=\"jobs\"}",
         "scpsfm_job_duration_seconds_count{state=\"SUCCEEDED\"}",
         "scpsfm_queue_wait_seconds_count",
     ] {
@@ -198,7 +203,8 @@ fn an_attempt_tells_its_wait_its_worker_and_its_stages() {
 
 /// Names of our metrics in a query or a whole file.
 fn names_in(text: &str) -> BTreeSet<&str> {
-    text.split(|c: char| !(c.is_ascii_alphanumeric() || c == '_')).filter(|word| word.starts_with("scpsfm_")).collect()
+    let words = text.split(|c: char| !(c.is_ascii_alphanumeric() || c == '_'));
+    words.filter(|word| word.starts_with("scpsfm_") || word.starts_with("process_")).collect()
 }
 
 fn is_exposed(name: &str) -> bool {

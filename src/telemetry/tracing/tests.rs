@@ -26,7 +26,7 @@ fn job() -> JobName {
 }
 
 fn options(format: Format, filter: &str) -> Options<'_> {
-    Options { format, filter, otlp_endpoint: None, service_name: "scpsfm" }
+    Options { format, filter, access: false, otlp_endpoint: None, service_name: "scpsfm" }
 }
 
 #[derive(Clone, Default)]
@@ -165,4 +165,22 @@ async fn a_collector_sees_one_trace_under_the_callers_traceparent() {
     let (search, refine) = (only(&spans, "search"), only(&spans, "refine"));
     assert_eq!((&search.parent_span_id, &refine.parent_span_id), (&second.span_id, &second.span_id));
     assert!(search.end_time_unix_nano <= refine.start_time_unix_nano, "one stage after the other");
+}
+
+#[test]
+fn the_audit_log_is_always_written_and_the_access_log_where_it_is_asked_for() {
+    for (access, count) in [(false, 1), (true, 2)] {
+        let lines = Lines::default();
+        let writer = lines.clone();
+        let options = Options { access, ..options(Format::Json, "off") };
+        let (subscriber, _guard) = build(options, move || writer.clone(), false).expect("subscriber");
+        with_default(subscriber, || {
+            tracing::info!(target: super::ACCESS, "call");
+            tracing::info!(target: super::AUDIT, "audit");
+            tracing::error!("filtered");
+        });
+        let text = lines.text();
+        assert_eq!(text.lines().count(), count, "{text}");
+        assert!(text.contains("scpsfm::audit") && text.contains("scpsfm::access") == access, "{text}");
+    }
 }
