@@ -1,5 +1,10 @@
-//! One attempt at a job, from its claim to its end: reads the input, feeds the worker, stores progress, keeps the
+//! One attempt at a job, from its lease to its end: loads the input, hands it to the worker, stores progress, keeps the
 //! lease, commits what it came to.
+//!
+//! A job that is claimed is begun with its lease. One that is prefetched is loaded while the worker solves another one,
+//! and begun by the worker itself the moment that it is free: between two short jobs it would else wait for a commit of
+//! the store and a dozen wake-ups beside busy solvers, some 3 ms. The store is told meanwhile. Where it says that
+//! another worker was first, or that the job was cancelled, the work is stopped, and nothing was written of it.
 
 use std::collections::hash_map::Entry;
 use std::pin::pin;
@@ -7,14 +12,14 @@ use std::sync::Arc;
 use std::time::{Duration, SystemTime};
 
 use tokio::time::{Instant, Interval, MissedTickBehavior, interval_at, sleep, sleep_until, timeout_at};
+use tracing::{Instrument, Span};
 
-use super::ahead::Reserved;
 use super::observe::{self, Attempt, AttemptLost};
-use super::worker::{Assignment, Heard, Opening, Report, Verdict, Worker};
-use super::{Inner, Options, locked};
+use super::worker::{Assignment, AttemptHandle, Report, Started, Verdict, Worker};
+use super::{Inner, locked};
 use crate::domain::job::{Failure, Job, JobName, JobState};
 use crate::domain::{Grade, Progress, StopReason, StopToken};
-use crate::store::{self, Ending, Lease, Outcome, Store};
+use crate::store::{self, Claimed, Ending, Lease, Outcome, Store};
 
 /// Least time between two stored progress events of a job: twice a second is as fast as people look, and a commit
 /// each is cheap for the disk.
@@ -51,39 +56,19 @@ async fn read(store: Arc<dyn Store>, name: JobName, stop: StopToken) -> Result<V
     Ok(work.input)
 }
 
-/// What an attempt came to, to be committed.
-pub(super) struct End {
-    pub verdict: Verdict,
-    pub latest: Option<Progress>,
-    pub attempt: Option<Attempt>,
-}
-
-/// What came of the claim of a job that a worker has begun.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(super) enum Leasing {
-    Leased,
-    /// It is another's by now, or nobody's.
-    Gone,
-    /// The store did not take it.
-    Failed,
-}
-
-/// What a job had behind it when it was claimed.
-pub(super) struct Wait {
-    pub trace_parent: Option<String>,
-    /// When it entered the queue.
-    pub queue_time: SystemTime,
-}
-
 /// An attempt under way.
 pub(super) struct JobExecution {
     inner: Arc<Inner>,
     job: Job,
     lease: Lease,
-    wait: Wait,
+    trace_parent: Option<String>,
+    /// When the job entered the queue.
+    queue_time: SystemTime,
     stop: StopToken,
-    /// Until it is leased.
-    reserved: Option<Arc<Reserved>>,
+    /// Here unless a worker has it; of a prefetched job there is none.
+    attempt: Option<Attempt>,
+    /// The attempt's, once it is begun: what is logged within carries the job's name.
+    span: Span,
     /// Until then the lease holds for sure.
     leased_until: Instant,
     /// The lease is gone: nothing more is written.
@@ -93,7 +78,20 @@ pub(super) struct JobExecution {
     _running: Running,
 }
 
-/// Lists an attempt among the running ones as long as it lives.
+/// An attempt in a worker's hands.
+pub(super) struct Loaded {
+    execution: JobExecution,
+    handle: AttemptHandle,
+}
+
+/// An attempt that is over, and that the store does not know of yet.
+pub(super) struct Finished {
+    execution: JobExecution,
+    verdict: Verdict,
+    latest: Option<Progress>,
+}
+
+/// Lists an attempt among the running ones as long as it lives, and stops what is left of it then.
 struct Running {
     inner: Arc<Inner>,
     lease: Lease,
@@ -101,34 +99,28 @@ struct Running {
 }
 
 impl Running {
-    fn list(inner: Arc<Inner>, lease: &Lease, stop: &StopToken) -> Self {
-        locked(&inner.running).insert(lease.clone(), stop.clone());
-        Self { inner, lease: lease.clone(), stop: stop.clone() }.unless_recalled()
-    }
-
-    /// The same, unless another slot has it.
-    fn list_new(inner: Arc<Inner>, lease: &Lease, stop: &StopToken) -> Option<Self> {
-        if let Entry::Vacant(place) = locked(&inner.running).entry(lease.clone()) {
-            place.insert(stop.clone());
-        } else {
-            return None;
+    fn list(inner: Arc<Inner>, lease: &Lease, stop: &StopToken, is_begun: bool) -> Self {
+        match locked(&inner.running).entry(lease.clone()) {
+            Entry::Vacant(place) => {
+                place.insert(stop.clone());
+            }
+            // Another slot has prefetched it, and is not the first to begin.
+            Entry::Occupied(mut other) if is_begun => other.insert(stop.clone()).stop(StopReason::Interrupted),
+            Entry::Occupied(_) => stop.stop(StopReason::Interrupted),
         }
-        Some(Self { inner, lease: lease.clone(), stop: stop.clone() }.unless_recalled())
-    }
-
-    /// Stops what was claimed while a drain told those that were listed to stop.
-    fn unless_recalled(self) -> Self {
-        if self.inner.hurried.is_cancelled() {
-            self.stop.stop(StopReason::Interrupted);
+        // Claimed while a drain told those that were listed to stop.
+        if inner.hurried.is_cancelled() {
+            stop.stop(StopReason::Interrupted);
         }
-        self
+        Self { inner, lease: lease.clone(), stop: stop.clone() }
     }
 }
 
 impl Drop for Running {
     fn drop(&mut self) {
+        self.stop.stop(StopReason::Interrupted);
         let mut running = locked(&self.inner.running);
-        // A slot that claimed what this one had only foreseen has its own there.
+        // A slot that begins what this one had only prefetched has its own there.
         if running.get(&self.lease).is_some_and(|listed| listed.is(&self.stop)) {
             running.remove(&self.lease);
         }
@@ -136,106 +128,87 @@ impl Drop for Running {
 }
 
 /// How a job is told to stop, which it does by itself at its deadline.
-pub(super) fn stop_token(job: &Job, now: SystemTime) -> StopToken {
+fn stop_token(job: &Job, now: SystemTime) -> StopToken {
     let left = job.deadline.map(|deadline| deadline.duration_since(now).unwrap_or_default());
     // A deadline beyond what the clock can express is none.
     StopToken::with_deadline(left.and_then(|left| std::time::Instant::now().checked_add(left)))
 }
 
 impl JobExecution {
-    /// Of a job that is leased.
-    pub(super) fn begin(inner: Arc<Inner>, job: Job, lease: Lease, wait: Wait) -> Self {
+    /// Of a job that is leased: claimed, or prefetched for so long.
+    pub(super) fn new(inner: Arc<Inner>, claimed: Claimed, lease_for: Duration) -> Self {
+        let Claimed { job, lease, trace_parent, queue_time } = claimed;
         let stop = stop_token(&job, inner.now());
-        let running = Running::list(inner.clone(), &lease, &stop);
-        let mut execution = Self::new(inner, job, lease, wait, stop, running);
-        let now = execution.inner.now();
-        execution.is_leased(Instant::now(), now);
-        execution
-    }
-
-    /// Of a job that a worker has begun and that is to be leased; `None` where another slot has it.
-    ///
-    /// * `stop`: ends what the worker has begun
-    pub(super) fn foreseen(
-        job: Job,
-        lease: Lease,
-        wait: Wait,
-        stop: StopToken,
-        reserved: Arc<Reserved>,
-    ) -> Option<Self> {
-        let inner = reserved.inner().clone();
-        let running = Running::list_new(inner.clone(), &lease, &stop)?;
-        Some(Self { reserved: Some(reserved), ..Self::new(inner, job, lease, wait, stop, running) })
-    }
-
-    fn new(inner: Arc<Inner>, job: Job, lease: Lease, wait: Wait, stop: StopToken, running: Running) -> Self {
-        let leased_until = Instant::now();
-        Self {
+        let running = Running::list(inner.clone(), &lease, &stop, job.state == JobState::Running);
+        let mut execution = Self {
             inner,
             job,
             lease,
-            wait,
+            trace_parent,
+            queue_time,
             stop,
-            reserved: None,
-            leased_until,
+            attempt: None,
+            span: Span::none(),
+            leased_until: Instant::now() + lease_for,
             lost: false,
             stored: None,
             _running: running,
-        }
-    }
-
-    /// The job was leased, for work that began at this time.
-    fn is_leased(&mut self, at: Instant, time: SystemTime) {
-        self.leased_until = at + self.inner.options.lease;
-        self.inner.hub.wake(&self.job.name);
-        observe::waited(&self.job.name, self.wait.trace_parent.as_deref(), self.wait.queue_time, time);
-        tracing::info!("attempt begins");
-    }
-
-    /// Leases a job that a worker began with at this time; where that fails, nothing of this attempt is written.
-    async fn claim(&mut self, at: Instant, time: SystemTime) -> Leasing {
-        let Options { worker_name, lease, .. } = &self.inner.options;
-        let claimed =
-            self.inner.store.claim_foreseen(&self.lease, self.job.create_time, worker_name, time, *lease).await;
-        let leasing = match claimed {
-            Ok(Some(_)) => Leasing::Leased,
-            Ok(None) => Leasing::Gone,
-            Err(error) => {
-                self.inner.not_claimed(&error);
-                Leasing::Failed
-            }
         };
-        if leasing == Leasing::Leased {
-            self.inner.queue_changed();
-            self.is_leased(at, time);
-        } else {
-            self.lapse();
+        if execution.is_begun() {
+            let Lease { name, attempt } = &execution.lease;
+            let attempt = Attempt::begin(name, *attempt, execution.trace_parent.as_deref());
+            let begun = Started { span: attempt.span().clone(), at: Instant::now() };
+            execution.attempt = Some(attempt);
+            let now = execution.inner.now();
+            execution.has_begun(begun, now);
         }
-        self.reserved = None;
-        leasing
+        execution
     }
 
-    /// Has the worker solve the job, and keeps the lease meanwhile.
-    pub(super) async fn run(&mut self, worker: &Worker, attempt: Attempt, input: Vec<u8>) -> End {
-        let subscription = self.inner.hub.subscribe(&self.job.name);
-        // Weights of an attempt before this one are nobody's any more.
-        subscription.topic().weights.send_replace(None);
-        let opening = Opening::Begun(attempt);
-        let (assignment, heard) =
-            Assignment::new(&self.job, self.lease.attempt, opening, input, self.stop.clone(), subscription);
-        worker.assign(assignment).await;
-        self.attend(heard).await
+    /// Whether the store knows it as running; else it is prefetched.
+    fn is_begun(&self) -> bool {
+        self.job.state == JobState::Running
     }
 
-    /// Leases a job that a worker began with at this time, and keeps the lease until it is solved.
-    pub(super) async fn run_foreseen(&mut self, at: Instant, time: SystemTime, heard: Heard) -> (Leasing, End) {
-        let leasing = self.claim(at, time).await;
-        (leasing, self.attend(heard).await)
+    fn has_begun(&mut self, begun: Started, now: SystemTime) {
+        self.leased_until = begun.at + self.inner.options.lease;
+        self.inner.hub.wake(&self.job.name);
+        observe::waited(&self.job.name, self.trace_parent.as_deref(), self.queue_time, now);
+        begun.span.in_scope(|| tracing::info!("attempt begins"));
+        self.span = begun.span;
+    }
+
+    /// Reads the input and hands the job to the worker. Returns the end of the attempt where there is nothing to solve.
+    pub(super) async fn load(mut self, worker: &Worker) -> Result<Loaded, Finished> {
+        let span = self.span.clone();
+        let loading = async {
+            let input = match self.read_input().await {
+                Ok(input) => input,
+                Err(verdict) => return Err(Finished { execution: self, verdict, latest: None }),
+            };
+            let subscription = self.inner.hub.subscribe(&self.job.name);
+            // Weights of an attempt before this one are nobody's any more.
+            subscription.topic().weights.send_replace(None);
+            let assignment = Assignment {
+                name: self.job.name.clone(),
+                number: self.lease.attempt,
+                trace_parent: self.trace_parent.clone(),
+                attempt: self.attempt.take(),
+                input,
+                settings: self.job.settings.clone(),
+                stop: self.stop.clone(),
+                subscription,
+            };
+            let handle = worker.assign(assignment).await;
+            Ok(Loaded { execution: self, handle })
+        };
+        loading.instrument(span).await
     }
 
     /// Reads the input, and the cancel that may have come before the job was listed as running. A store that is out
-    /// of reach is asked again as long as the lease holds, which heartbeats keep while a large input is read.
-    pub(super) async fn prepare(&mut self) -> Result<Vec<u8>, Verdict> {
+    /// of reach is asked again as long as the lease holds, which heartbeats keep while a large input is read. There are
+    /// none for a prefetched job.
+    async fn read_input(&mut self) -> Result<Vec<u8>, Verdict> {
         loop {
             let mut reading = pin!(read(self.inner.store.clone(), self.job.name.clone(), self.stop.clone()));
             let mut heartbeats = self.heartbeats();
@@ -243,7 +216,7 @@ impl JobExecution {
                 tokio::select! {
                     biased;
                     input = &mut reading => break input,
-                    _ = heartbeats.tick(), if !self.lost => {
+                    _ = heartbeats.tick(), if self.is_begun() && !self.lost => {
                         self.heartbeat().await;
                     }
                 }
@@ -271,8 +244,9 @@ impl JobExecution {
     }
 
     /// Keeps the lease and stores progress until the worker reports, if it lives to do so.
-    async fn attend(&mut self, heard: Heard) -> End {
-        let Heard { progress: mut reported, report: mut answer } = heard;
+    async fn attend(mut self, handle: AttemptHandle) -> Finished {
+        // Held, so that the worker begins.
+        let AttemptHandle { started: _started, progress: mut reported, report: mut answer } = handle;
         let mut heartbeats = self.heartbeats();
         let mut next_store = Instant::now() + FIRST_PROGRESS;
         let mut news = false;
@@ -297,10 +271,14 @@ impl JobExecution {
             }
         };
         let latest = *reported.borrow();
-        match report {
-            Some(Report { verdict, attempt }) => End { verdict, latest, attempt: Some(attempt) },
-            None => End { verdict: Verdict::Stopped(StopReason::Interrupted), latest, attempt: None },
-        }
+        let verdict = match report {
+            Some(Report { verdict, attempt }) => {
+                self.attempt = Some(attempt);
+                verdict
+            }
+            None => Verdict::Stopped(StopReason::Interrupted),
+        };
+        Finished { execution: self, verdict, latest }
     }
 
     async fn store_progress(&mut self, progress: Option<Progress>) {
@@ -354,22 +332,6 @@ impl JobExecution {
         self.stop.stop(StopReason::Interrupted);
     }
 
-    /// Commits what the attempt came to.
-    pub(super) async fn conclude(mut self, end: End) {
-        let End { verdict, latest, attempt } = end;
-        let outcome = match verdict {
-            Verdict::Solved { summary, result } => Some(Outcome::Succeeded { summary, result }),
-            Verdict::Broken(message) => Some(Outcome::Failed(Failure::new(INTERNAL, message))),
-            Verdict::Stopped(StopReason::Cancelled) => Some(Outcome::Cancelled),
-            Verdict::Stopped(StopReason::DeadlineExceeded) => Some(Outcome::DeadlineExceeded),
-            Verdict::Stopped(StopReason::Interrupted) => None,
-        };
-        let progress = latest.filter(|_| self.stored != latest);
-        let ending = outcome.map(|outcome| Arc::new(Ending { outcome, progress }));
-        let committed = self.commit(ending.as_ref()).await;
-        self.announce(committed, attempt);
-    }
-
     /// Ends the job or gives it back, trying again as long as the lease holds. `None`: the lease is gone.
     async fn commit(&mut self, ending: Option<&Arc<Ending>>) -> Option<Job> {
         let store = self.inner.store.clone();
@@ -410,9 +372,9 @@ impl JobExecution {
         ours.then_some(job)
     }
 
-    fn announce(self, committed: Option<Job>, attempt: Option<Attempt>) {
+    fn announce(mut self, committed: Option<Job>) {
         let ended_in = committed.as_ref().map(|job| job.state).filter(|state| state.is_terminal());
-        if let Some(attempt) = attempt {
+        if let Some(attempt) = self.attempt.take() {
             attempt.end(ended_in);
         }
         match (committed, ended_in) {
@@ -443,5 +405,55 @@ impl JobExecution {
                 observe::attempt_lost(AttemptLost::Fenced);
             }
         }
+    }
+}
+
+impl Loaded {
+    /// Waits until the worker begins with a prefetched job, and tells the store. Returns the attempt with the job that
+    /// was prefetched in the same commit; `None` where the job is another worker's by now, or nobody's.
+    pub(super) async fn begin(self) -> Option<(Self, Option<Claimed>)> {
+        let Self { mut execution, mut handle } = self;
+        let begun = (&mut handle.started).await.ok()?;
+        let prefetched = (execution.lease.clone(), execution.job.create_time);
+        let now = execution.inner.now();
+        let claims = execution.inner.claim(Some(prefetched), now).instrument(begun.span.clone()).await;
+        let Some(claimed) = claims.begun else {
+            execution.lapse();
+            // Until then the worker is not free. What it answers is nobody's.
+            let _ = handle.report.await;
+            return None;
+        };
+        execution.job = claimed.job;
+        execution.has_begun(begun, now);
+        Some((Self { execution, handle }, claims.prefetched))
+    }
+
+    /// Until the worker is done.
+    pub(super) async fn run(self) -> Finished {
+        let Self { execution, handle } = self;
+        let span = execution.span.clone();
+        execution.attend(handle).instrument(span).await
+    }
+}
+
+impl Finished {
+    /// Commits what the attempt came to.
+    pub(super) async fn finalise(self) {
+        let Self { mut execution, verdict, latest } = self;
+        let span = execution.span.clone();
+        let finalising = async {
+            let outcome = match verdict {
+                Verdict::Solved { summary, result } => Some(Outcome::Succeeded { summary, result }),
+                Verdict::Broken(message) => Some(Outcome::Failed(Failure::new(INTERNAL, message))),
+                Verdict::Stopped(StopReason::Cancelled) => Some(Outcome::Cancelled),
+                Verdict::Stopped(StopReason::DeadlineExceeded) => Some(Outcome::DeadlineExceeded),
+                Verdict::Stopped(StopReason::Interrupted) => None,
+            };
+            let progress = latest.filter(|_| execution.stored != latest);
+            let ending = outcome.map(|outcome| Arc::new(Ending { outcome, progress }));
+            let committed = execution.commit(ending.as_ref()).await;
+            execution.announce(committed);
+        };
+        finalising.instrument(span).await;
     }
 }

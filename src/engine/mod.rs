@@ -3,8 +3,6 @@
 //! Knows nothing of transport. Depends on `store`, `solver`, `telemetry` and `domain`; its channels never leave it.
 
 mod admin;
-mod ahead;
-mod attempt;
 mod clock;
 mod drain;
 mod error;
@@ -31,7 +29,7 @@ use tokio_util::sync::CancellationToken;
 
 pub use crate::store::{
     EncodedResult, InputPage, InputQuery, JobPage, JobQuery, Load, NewUpload, Order, QueueBounds, QueueReport,
-    StoredInput, TakenId, TenantQueue, UploadBounds, UploadStatus,
+    StoredInput, TakenId, TenantQueue, TenantShares, UploadBounds, UploadStatus,
 };
 pub use crate::telemetry::metrics::GivenUp;
 pub use clock::Clock;
@@ -74,6 +72,8 @@ pub struct Options {
     pub workers: usize,
     /// What may wait at once.
     pub queue: QueueBounds,
+    /// How tenants share the workers.
+    pub shares: Arc<TenantShares>,
     /// How long a worker may be silent before its job is taken from it; held to
     /// [`Options::MIN_LEASE`]..=[`Options::MAX_LEASE`].
     pub lease: Duration,
@@ -84,7 +84,8 @@ pub struct Options {
     pub retention: Option<Duration>,
     /// What callers of a full queue are told to wait.
     pub retry_after: Duration,
-    /// Jobs that are solved in less than this are short: behind one the next is begun at once, and leased meanwhile.
+    /// Jobs that are solved in less than this are short: behind one the next, which is prefetched, is begun at once.
+    /// Zero: none is prefetched.
     pub short_job: Duration,
     /// Tells this process apart in the store.
     pub worker_name: String,
@@ -134,6 +135,7 @@ impl Default for Options {
                 max_tenant_jobs: u64::MAX,
                 max_tenant_bytes: u64::MAX,
             },
+            shares: Arc::default(),
             uploads: UploadOptions::default(),
             lease: Self::DEFAULT_LEASE,
             max_attempts: Self::DEFAULT_MAX_ATTEMPTS,
@@ -189,10 +191,8 @@ struct Inner {
     options: Options,
     store: Arc<dyn Store>,
     hub: Arc<hub::Hub>,
-    /// Attempts that run in this process, for a cancel to reach them at once.
+    /// Attempts that run in this process or are prefetched, for a cancel to reach them at once.
     running: Mutex<HashMap<Lease, StopToken>>,
-    /// Jobs that slots foresee to be theirs next.
-    foreseen: Mutex<HashMap<JobName, Arc<()>>>,
     /// Counts the reasons to look for a job to claim; slots wait for a change.
     work: channel::Sender<u64>,
     /// Wakes the task that counts the queue.
@@ -234,7 +234,6 @@ impl Engine {
             store,
             hub: Arc::default(),
             running: Mutex::default(),
-            foreseen: Mutex::default(),
             work: channel::Sender::new(0),
             queue_changed: Notify::new(),
             webhook_due: Notify::new(),
@@ -428,7 +427,6 @@ impl Inner {
         let reply = self.store.request_cancel(name, etag, self.now()).await?;
         self.stop_attempts(name);
         if reply.ended_now {
-            locked(&self.foreseen).remove(name);
             self.ended(&reply.job);
         }
         Ok(self.dated(reply.job))
@@ -441,6 +439,10 @@ impl Inner {
         self.queue_changed();
         if job.webhook.is_some() {
             self.webhook_due.notify_one();
+        }
+        if self.options.shares.max_running.is_some() {
+            // Its tenant may begin another one.
+            self.work_waits();
         }
     }
 

@@ -2,16 +2,15 @@
 
 use std::pin::pin;
 use std::sync::Arc;
-use std::time::Duration;
+use std::time::{Duration, SystemTime};
 
 use tokio::task::JoinHandle;
-use tokio::time::{Instant, sleep, sleep_until, timeout, timeout_at};
+use tokio::time::{Instant, sleep, sleep_until, timeout};
 
-use super::ahead::Ahead;
-use super::attempt::{self, Ran, Ready};
+use super::execution::{Finished, JobExecution, Loaded};
 use super::worker::Worker;
-use super::{Inner, Phase, StoreState, locked, observe};
-use crate::store;
+use super::{Inner, Options, Phase, StoreState, observe};
+use crate::store::{self, Claim, Claimed, Claims, Lease, Prefetch};
 
 /// How often a slot looks for work unasked: jobs of other processes and of a store that failed come without a wake-up.
 const CLAIM_POLL: Duration = Duration::from_secs(1);
@@ -29,109 +28,102 @@ const STATS_PERIOD: Duration = Duration::from_secs(5);
 /// writers wait for some hundred megabytes at worst.
 const PURGE_BATCH: u32 = 32;
 
+/// Observations of a job beyond which it is not prefetched, some 2 MB of input: none that large is solved in the time
+/// that prefetching is for.
+const MAX_PREFETCH_OBSERVATIONS: u32 = 100_000;
+
 /// Claims jobs for one worker, one after the other, until the engine drains. While what a job came to is committed, the
 /// next one is claimed, so that the worker waits for one commit of the store, not for two, and the store may make one
-/// of both. After a short job it waits for none: see [`solve`].
+/// of both. After a short job it waits for none: the next one is prefetched.
 pub(super) async fn run(inner: Arc<Inner>, worker: Worker) {
     let mut work = inner.work.subscribe();
     let mut phase = inner.phase.subscribe();
-    let mut committing: Option<Committing> = None;
-    let mut ahead: Option<Ahead> = None;
+    let mut committing: Option<Task<()>> = None;
+    let mut prefetched: Option<Prefetched> = None;
     while *phase.borrow_and_update() == Phase::Open {
         // Before the look, so that a job that is stored during it is not missed.
         work.mark_unchanged();
-        let ready = match ahead.take() {
-            Some(ahead) => Some(Ready::Foreseen(Box::new(ahead))),
-            None => claim(&inner).await,
-        };
-        let Some(ready) = ready else {
-            tokio::select! {
-                biased;
-                _ = work.changed() => {}
-                _ = phase.changed() => {}
-                () = sleep(CLAIM_POLL) => {}
-            }
-            continue;
-        };
-        let ran;
-        (ran, ahead) = solve(&inner, &worker, ready).await;
-        match ran {
-            Ran::Done(done) => {
-                if let Some(mut before) = committing.replace(Committing(done.commit())) {
-                    // Results that the store cannot take must not pile up, nor are jobs begun that it may not lease.
-                    if timeout(inner.options.short_job, before.done()).await.is_err() {
-                        ahead = None;
-                        before.done().await;
+        let (loaded, next) = match prefetched.take() {
+            Some(mut loading) => match begin(&mut loading).await {
+                Some((loaded, next)) => (Ok(loaded), next),
+                None => continue,
+            },
+            None => {
+                let Claims { begun, prefetched: next } = inner.claim(None, inner.now()).await;
+                let Some(claimed) = begun else {
+                    tokio::select! {
+                        biased;
+                        _ = work.changed() => {}
+                        _ = phase.changed() => {}
+                        () = sleep(CLAIM_POLL) => {}
                     }
-                }
+                    continue;
+                };
+                let execution = JobExecution::new(inner.clone(), claimed, inner.options.lease);
+                (execution.load(&worker).await, next)
             }
-            Ran::Gone => {}
-            // Where the store takes no writes, the next claim says so, and waits.
-            Ran::NotLeased => ahead = None,
+        };
+        prefetched = next.map(|next| prefetch(&inner, &worker, next));
+        let finished = match loaded {
+            Ok(loaded) => solve(loaded, inner.options.short_job, &mut prefetched).await,
+            Err(finished) => finished,
+        };
+        if let Some(mut before) = committing.replace(Task(tokio::spawn(finished.finalise()))) {
+            // Results that the store cannot take must not pile up, nor are jobs begun that it may not lease.
+            if timeout(inner.options.short_job, before.output()).await.is_err() {
+                prefetched = None;
+                before.output().await;
+            }
         }
         if worker.is_gone() {
             tracing::error!("a worker thread is gone, its slot ends");
             break;
         }
     }
-    // Nobody is going to lease it.
-    drop(ahead);
+    // Nobody is going to begin it.
+    drop(prefetched);
     if let Some(mut last) = committing {
-        last.done().await;
+        last.output().await;
     }
 }
 
-/// The next job, leased; `None` where none waits.
-async fn claim(inner: &Arc<Inner>) -> Option<Ready> {
-    let options = &inner.options;
-    match inner.store.claim(&options.worker_name, inner.now(), options.lease).await {
-        Ok(claimed) => {
-            let claimed = claimed?;
-            // Whoever has foreseen it need not begin it.
-            locked(&inner.foreseen).remove(&claimed.job.name);
-            inner.queue_changed();
-            Some(attempt::begin(inner, claimed).await)
-        }
-        Err(error) => {
-            inner.not_claimed(&error);
-            None
-        }
+/// A job on its way into the worker's hands. Dropped, it is not begun, and its lease lapses.
+type Prefetched = Task<Option<Loaded>>;
+
+/// Loads a prefetched job.
+fn prefetch(inner: &Arc<Inner>, worker: &Worker, claimed: Claimed) -> Prefetched {
+    let execution = JobExecution::new(inner.clone(), claimed, inner.prefetch_lease());
+    let worker = worker.clone();
+    // One that cannot be read is told of when it is claimed.
+    Task(tokio::spawn(async move { execution.load(&worker).await.ok() }))
+}
+
+/// Begins with a prefetched job; `None` where it is not to be had any more.
+async fn begin(loading: &mut Prefetched) -> Option<(Loaded, Option<Claimed>)> {
+    loading.output().await??.begin().await
+}
+
+/// Has a job solved. Where it is no short one, what is prefetched behind it is left to others.
+async fn solve(loaded: Loaded, short_job: Duration, prefetched: &mut Option<Prefetched>) -> Finished {
+    let mut solving = pin!(loaded.run());
+    if let Ok(finished) = timeout(short_job, &mut solving).await {
+        return finished;
+    }
+    *prefetched = None;
+    solving.await
+}
+
+/// A task that is given up with the slot that waits for it.
+struct Task<T>(JoinHandle<T>);
+
+impl<T> Task<T> {
+    /// `None` where it broke off by a panic, which has been reported; a lease that it had runs out.
+    async fn output(&mut self) -> Option<T> {
+        (&mut self.0).await.ok()
     }
 }
 
-/// Has a job solved. Returns what it came to; and where it was a short one, the next one, which the worker begins with
-/// by itself before it is even leased.
-///
-/// Not where other processes take jobs from the same store: two would often begin the same one.
-async fn solve(inner: &Arc<Inner>, worker: &Worker, ready: Ready) -> (Ran, Option<Ahead>) {
-    let mut looks = !inner.store.is_shared();
-    let mut ahead = None;
-    let too_long = Instant::now() + inner.options.short_job;
-    let mut solving = pin!(ready.run(worker));
-    // Let go once it takes too long: it holds one of the store's few readers.
-    let mut looking = pin!(async { timeout_at(too_long, Ahead::look(inner, worker)).await.ok().flatten() });
-    loop {
-        tokio::select! {
-            biased;
-            ran = &mut solving => return (ran, ahead),
-            found = &mut looking, if looks => (looks, ahead) = (false, found),
-            // By the time that it ends others may have come, or this one gone.
-            () = sleep_until(too_long), if ahead.is_some() => ahead = None,
-        }
-    }
-}
-
-/// The end of a job on its way to the store; given up with the slot that waits for it.
-struct Committing(JoinHandle<()>);
-
-impl Committing {
-    async fn done(&mut self) {
-        // It only breaks off by a panic, which has been reported; the lease runs out.
-        let _ = (&mut self.0).await;
-    }
-}
-
-impl Drop for Committing {
+impl<T> Drop for Task<T> {
     fn drop(&mut self) {
         self.0.abort();
     }
@@ -196,6 +188,34 @@ async fn due(inner: &Inner, counted: Instant) {
 }
 
 impl Inner {
+    /// Begins with the next job in the queue, or with one that was prefetched, and prefetches the one after it. Nothing
+    /// where there is none to begin, or the store does not answer.
+    pub(super) async fn claim(&self, begin: Option<(Lease, SystemTime)>, now: SystemTime) -> Claims {
+        let Options { worker_name, lease, shares, short_job, .. } = &self.options;
+        let terms = Prefetch { lease_for: self.prefetch_lease(), max_observations: MAX_PREFETCH_OBSERVATIONS };
+        let claim = Claim {
+            worker: worker_name.clone(),
+            lease_for: *lease,
+            begin,
+            prefetch: (!short_job.is_zero()).then_some(terms),
+            shares: shares.clone(),
+        };
+        let claims = self.store.claim(&claim, now).await.unwrap_or_else(|error| {
+            self.not_claimed(&error);
+            Claims::default()
+        });
+        if claims.begun.is_some() {
+            self.queue_changed();
+        }
+        claims
+    }
+
+    /// How long a prefetched job is kept for its worker: until that has been at the job before it for too long to be
+    /// waited for, and has told the store of its begin.
+    fn prefetch_lease(&self) -> Duration {
+        self.options.short_job.saturating_mul(2)
+    }
+
     /// Removes jobs that have been kept long enough, and gives back the space of what was removed.
     async fn tidy(&self) {
         if let Some(ended_by) = self.options.retention.and_then(|kept| self.now().checked_sub(kept)) {
@@ -215,7 +235,7 @@ impl Inner {
     }
 
     /// Says why no job is begun. Of a full disk the store has told, once: here it would be told every second.
-    pub(super) fn not_claimed(&self, error: &store::Error) {
+    fn not_claimed(&self, error: &store::Error) {
         if self.store.has_room() {
             tracing::warn!(%error, "cannot claim a job");
         } else {

@@ -3,7 +3,7 @@
 
 use std::any::Any;
 use std::panic::{AssertUnwindSafe, catch_unwind};
-use std::sync::{Arc, Weak};
+use std::sync::Arc;
 use std::thread;
 use std::time::SystemTime;
 
@@ -11,11 +11,10 @@ use tokio::sync::{mpsc, oneshot, watch};
 use tokio::time::Instant;
 use tracing::Span;
 
-use super::ahead::Reserved;
 use super::hub::Subscription;
 use super::observe::Attempt;
 use super::{ResultEncoder, Solver};
-use crate::domain::job::{EventBody, Job, JobEvent, JobName, Summary};
+use crate::domain::job::{EventBody, JobEvent, JobName, Summary};
 use crate::domain::{Input, Observer, Progress, Solution, SolveSettings, Stage, StopReason, StopToken};
 use crate::solver;
 use crate::store::{EncodedResult, payload};
@@ -25,58 +24,41 @@ const STACK_BYTES: usize = 8 << 20;
 
 /// One attempt's worth of work.
 pub(super) struct Assignment {
-    name: JobName,
-    number: u32,
-    opening: Opening,
+    pub name: JobName,
+    pub number: u32,
+    pub trace_parent: Option<String>,
+    /// Of a job that is begun; that of a prefetched one begins with the work.
+    pub attempt: Option<Attempt>,
     /// Encoded input.
-    input: Vec<u8>,
-    settings: SolveSettings,
-    stop: StopToken,
-    progress: watch::Sender<Option<Progress>>,
-    subscription: Subscription,
-    reply: oneshot::Sender<Report>,
+    pub input: Vec<u8>,
+    pub settings: SolveSettings,
+    /// Stopped before it is begun, it is not begun.
+    pub stop: StopToken,
+    pub subscription: Subscription,
 }
 
-/// How an attempt is begun.
-pub(super) enum Opening {
-    /// It is, and its job is leased.
-    Begun(Attempt),
-    /// Once the worker is free, if the job is still to be had: the one who assigned it is told, and is to lease it
-    /// then.
-    Foreseen { reserved: Weak<Reserved>, trace_parent: Option<String>, tell: oneshot::Sender<Began> },
-}
-
-/// That a worker began with a job that was foreseen.
-pub(super) struct Began {
+/// The worker began.
+pub(super) struct Started {
     /// The attempt's.
     pub span: Span,
     pub at: Instant,
-    pub time: SystemTime,
 }
 
-/// What the one who assigned an attempt hears of it.
-pub(super) struct Heard {
+/// What is heard of an attempt in a worker's hands. Dropped before the work is begun, it is not begun.
+pub(super) struct AttemptHandle {
+    /// Dropped unanswered where the work is not begun.
+    pub started: oneshot::Receiver<Started>,
     pub progress: watch::Receiver<Option<Progress>>,
-    /// Dropped unanswered where the thread is gone, or the attempt was never begun.
+    /// Dropped unanswered where the thread is gone, or a prefetched job was not begun.
     pub report: oneshot::Receiver<Report>,
 }
 
-impl Assignment {
-    /// Of this attempt at a job; `stop` ends it early.
-    pub(super) fn new(
-        job: &Job,
-        number: u32,
-        opening: Opening,
-        input: Vec<u8>,
-        stop: StopToken,
-        subscription: Subscription,
-    ) -> (Self, Heard) {
-        let (progress, heard_progress) = watch::channel(None);
-        let (reply, report) = oneshot::channel();
-        let (name, settings) = (job.name.clone(), job.settings.clone());
-        let assignment = Self { name, number, opening, input, settings, stop, progress, subscription, reply };
-        (assignment, Heard { progress: heard_progress, report })
-    }
+/// An assignment on its way to the thread, with where it answers.
+pub(super) struct Assigned {
+    assignment: Assignment,
+    started: oneshot::Sender<Started>,
+    progress: watch::Sender<Option<Progress>>,
+    reply: oneshot::Sender<Report>,
 }
 
 /// What an attempt came to.
@@ -97,10 +79,10 @@ pub(super) enum Verdict {
     Broken(String),
 }
 
-/// Feeds one worker thread; the thread ends when it is dropped.
-#[derive(Debug)]
+/// Feeds one worker thread; the thread ends when the last of its feeders is dropped.
+#[derive(Debug, Clone)]
 pub(super) struct Worker {
-    assignments: mpsc::Sender<Assignment>,
+    assignments: mpsc::Sender<Assigned>,
 }
 
 impl Worker {
@@ -114,12 +96,12 @@ impl Worker {
         encode: ResultEncoder,
         alive: mpsc::Sender<()>,
     ) -> std::io::Result<(Self, thread::JoinHandle<()>)> {
-        let (assignments, mut inbox) = mpsc::channel::<Assignment>(1);
+        let (assignments, mut inbox) = mpsc::channel::<Assigned>(1);
         let handle =
             thread::Builder::new().name(format!("solver-{index}")).stack_size(STACK_BYTES).spawn(move || {
                 let _alive = alive;
-                while let Some(assignment) = inbox.blocking_recv() {
-                    work(assignment, &solver, encode);
+                while let Some(assigned) = inbox.blocking_recv() {
+                    work(assigned, &solver, encode);
                 }
             })?;
         Ok((Self { assignments }, handle))
@@ -127,15 +109,19 @@ impl Worker {
 
     /// Feeds who reads from the inbox.
     #[cfg(test)]
-    pub(super) fn with_inbox() -> (Self, mpsc::Receiver<Assignment>) {
+    pub(super) fn with_inbox() -> (Self, mpsc::Receiver<Assigned>) {
         let (assignments, inbox) = mpsc::channel(1);
         (Self { assignments }, inbox)
     }
 
     /// Hands over work, which is begun once what was handed over before is done; waits where that is not begun either.
-    pub(super) async fn assign(&self, assignment: Assignment) {
+    pub(super) async fn assign(&self, assignment: Assignment) -> AttemptHandle {
+        let (started, heard_started) = oneshot::channel();
+        let (progress, heard_progress) = watch::channel(None);
+        let (reply, report) = oneshot::channel();
         // A send that fails drops the assignment and its reply, which is the answer.
-        let _ = self.assignments.send(assignment).await;
+        let _ = self.assignments.send(Assigned { assignment, started, progress, reply }).await;
+        AttemptHandle { started: heard_started, progress: heard_progress, report }
     }
 
     /// Whether the thread has ended: nothing in it should be able to.
@@ -144,30 +130,39 @@ impl Worker {
     }
 }
 
-impl Opening {
-    /// The attempt that begins now; `None` where nobody wants it any more.
-    fn open(self, name: &JobName, number: u32) -> Option<Attempt> {
-        match self {
-            Self::Begun(attempt) => Some(attempt),
-            Self::Foreseen { reserved, trace_parent, tell } => {
-                if !reserved.upgrade().is_some_and(|reserved| reserved.holds()) {
-                    return None;
-                }
-                let attempt = Attempt::begin(name, number, trace_parent.as_deref());
-                let began = Began { span: attempt.span().clone(), at: Instant::now(), time: SystemTime::now() };
-                tell.send(began).is_ok().then_some(attempt)
+/// An attempt whose work begins.
+struct Opened {
+    input: Vec<u8>,
+    settings: SolveSettings,
+    stop: StopToken,
+    reporter: Reporter,
+    reply: oneshot::Sender<Report>,
+}
+
+impl Assigned {
+    /// Begins with the work; `None` where it was stopped before, or nobody wants it any more.
+    fn open(self) -> Option<Opened> {
+        let Self { assignment, started, progress, reply } = self;
+        let Assignment { name, number, trace_parent, attempt, input, settings, stop, subscription } = assignment;
+        if let Some(reason) = stop.reason() {
+            if let Some(attempt) = attempt {
+                // As below, nobody may be listening.
+                let _ = reply.send(Report { verdict: Verdict::Stopped(reason), attempt });
             }
+            return None;
         }
+        let attempt = attempt.unwrap_or_else(|| Attempt::begin(&name, number, trace_parent.as_deref()));
+        started.send(Started { span: attempt.span().clone(), at: Instant::now() }).ok()?;
+        let reporter = Reporter { name, number, progress, subscription, attempt };
+        Some(Opened { input, settings, stop, reporter, reply })
     }
 }
 
-fn work(assignment: Assignment, solver: &Solver, encode: ResultEncoder) {
-    let Assignment { name, number, opening, input, settings, stop, progress, subscription, reply } = assignment;
-    let Some(mut attempt) = opening.open(&name, number) else { return };
-    attempt.at_work();
-    let span = attempt.span().clone();
+fn work(assigned: Assigned, solver: &Solver, encode: ResultEncoder) {
+    let Some(Opened { input, settings, stop, mut reporter, reply }) = assigned.open() else { return };
+    reporter.attempt.at_work();
+    let span = reporter.attempt.span().clone();
     let _entered = span.enter();
-    let mut reporter = Reporter { name, number, progress, subscription, attempt };
     let verdict = catch_unwind(AssertUnwindSafe(|| solve(input, &settings, &mut reporter, &stop, solver, encode)))
         .unwrap_or_else(|panic| Verdict::Broken(format!("the solver panicked: {}", panic_message(panic.as_ref()))));
     reporter.attempt.at_rest();
@@ -264,16 +259,15 @@ pub(super) struct Simulated {
 }
 
 #[cfg(test)]
-impl Assignment {
+impl Assigned {
     pub(super) fn settings(&self) -> &SolveSettings {
-        &self.settings
+        &self.assignment.settings
     }
 
     /// Begins with it; `None` where nobody wants it any more.
     pub(super) fn begin(self) -> Option<Simulated> {
-        let Self { name, number, opening, stop, progress, subscription, reply, .. } = self;
-        let attempt = opening.open(&name, number)?;
-        Some(Simulated { reporter: Reporter { name, number, progress, subscription, attempt }, stop, reply })
+        let Opened { reporter, stop, reply, .. } = self.open()?;
+        Some(Simulated { reporter, stop, reply })
     }
 }
 

@@ -29,8 +29,9 @@ use crate::domain::{InputName, Oversize};
 pub use input_query::{InputPage, InputQuery};
 pub use query::{JobPage, JobQuery, Order};
 pub use record::{
-    Bound, CancelReply, Claimed, Created, EncodedResult, Ending, Heartbeat, JobInput, Lease, Load, NewRecord, Outcome,
-    QueueBounds, QueueReport, Request, RetryReply, StoreStats, Swept, TenantQueue, WebhookOutcome, WebhookQueue, Work,
+    Bound, CancelReply, Claim, Claimed, Claims, Created, EncodedResult, Ending, Heartbeat, JobInput, Lease, Load,
+    NewRecord, Outcome, Prefetch, QueueBounds, QueueReport, Request, RetryReply, StoreStats, Swept, TenantQueue,
+    TenantShares, WebhookOutcome, WebhookQueue, Work,
 };
 pub use upload::{
     BegunUpload, NewInput, NewUpload, PurgedUploads, StoredInput, UploadBound, UploadBounds, UploadLease, UploadStatus,
@@ -163,24 +164,14 @@ pub trait Store: Send + Sync + 'static {
     /// [`Error::NotFound`].
     async fn events_after(&self, name: &JobName, after: u64, limit: u32) -> Result<Vec<JobEvent>, Error>;
 
-    /// Leases the queued job that is next by priority, then age; `None` when nothing is queued, or the queue is paused.
-    /// Jobs past their deadline are left to [`Store::sweep`].
-    async fn claim(&self, worker: &str, now: SystemTime, lease_for: Duration) -> Result<Option<Claimed>, Error>;
-
-    /// The job that a claim would lease, but for those that are `passed` over, as its claim would return it. It is not
-    /// leased: see [`Store::claim_foreseen`].
-    async fn foresee(&self, passed: &[JobName], now: SystemTime) -> Result<Option<Claimed>, Error>;
-
-    /// Leases a job that was foreseen, `created` then; `None` where it is not queued any more, was attempted since, or
-    /// is another one of the same name.
-    async fn claim_foreseen(
-        &self,
-        foreseen: &Lease,
-        created: SystemTime,
-        worker: &str,
-        now: SystemTime,
-        lease_for: Duration,
-    ) -> Result<Option<Claimed>, Error>;
+    /// Leases the next job in the queue and begins it; nothing where none waits, or the queue is paused. Tenants
+    /// take turns, by their weights;
+    /// within a tenant jobs go by priority, then age. Jobs past their deadline are left to [`Store::sweep`].
+    ///
+    /// The claim may also prefetch: it leases the job after it, which stays queued until a later claim begins it. Other
+    /// claims pass over a prefetched job until that lease expires, but for those that find no other job. Nothing need
+    /// be given back: a prefetched job that is not begun in time is any worker's, and no attempt was made.
+    async fn claim(&self, claim: &Claim, now: SystemTime) -> Result<Claims, Error>;
 
     /// The encoded input of a job, and whether its cancel has been asked for.
     ///

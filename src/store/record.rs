@@ -2,6 +2,7 @@
 
 use std::collections::BTreeMap;
 use std::fmt;
+use std::sync::Arc;
 use std::time::{Duration, SystemTime};
 
 use sha2::{Digest, Sha256};
@@ -236,6 +237,63 @@ impl Load {
 fn first_broken<const N: usize>(amounts: [(Quota, u64, u64); N]) -> Option<Oversize> {
     let broken = amounts.into_iter().find(|(_, asked, max)| asked > max);
     broken.map(|(quota, asked, max)| Oversize { quota, asked, max })
+}
+
+/// How tenants share the workers.
+#[derive(Debug, Clone, PartialEq, Eq, Default)]
+pub struct TenantShares {
+    /// Jobs that a tenant begins for each that one of weight 1 begins, while both have some waiting; 1 for those that
+    /// are not named.
+    pub weights: BTreeMap<String, u32>,
+    /// Jobs of one tenant that run at once at most.
+    pub max_running: Option<u32>,
+}
+
+impl TenantShares {
+    /// Of a tenant, at least 1.
+    pub fn weight(&self, tenant: &str) -> u32 {
+        self.weights.get(tenant).copied().unwrap_or(1).max(1)
+    }
+}
+
+/// What a worker asks the queue for.
+#[derive(Debug, Clone)]
+pub struct Claim {
+    /// The process that asks.
+    pub worker: String,
+    /// How long the job that is begun is leased for.
+    pub lease_for: Duration,
+    /// The job to begin: one that an earlier claim prefetched, with its time of creation, which tells it from a later
+    /// job of the same name. `None`: the next one in the queue.
+    pub begin: Option<(Lease, SystemTime)>,
+    /// Where one is begun, the one after it is leased too; `None`: no other one.
+    pub prefetch: Option<Prefetch>,
+    pub shares: Arc<TenantShares>,
+}
+
+impl Claim {
+    /// Of the next job alone, where all tenants have equal shares.
+    pub fn one(worker: &str, lease_for: Duration) -> Self {
+        Self { worker: worker.into(), lease_for, begin: None, prefetch: None, shares: Arc::default() }
+    }
+}
+
+/// A job that is leased ahead of its begin.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct Prefetch {
+    /// How long other claims pass over it.
+    pub lease_for: Duration,
+    /// None larger is leased ahead.
+    pub max_observations: u32,
+}
+
+/// What a claim came to.
+#[derive(Debug, Clone, PartialEq, Default)]
+pub struct Claims {
+    /// It is running.
+    pub begun: Option<Claimed>,
+    /// It is queued. Its lease is that of the attempt which a later claim is to begin.
+    pub prefetched: Option<Claimed>,
 }
 
 /// The right to write to a running job. `attempt` is the fencing token: a later lease has a larger one.

@@ -4,10 +4,10 @@ use std::sync::Arc;
 use std::time::{Duration, SystemTime};
 
 use super::{
-    BegunUpload, CancelReply, Claimed, Created, EncodedResult, Ending, Error, Heartbeat, Hint, InputPage, InputQuery,
-    JobPage, JobQuery, Lease, Load, NewInput, NewRecord, NewUpload, PurgedUploads, QueueBounds, QueueReport,
-    RetryReply, Store, StoreStats, StoredInput, Swept, UploadBounds, UploadLease, UploadStatus, WebhookOutcome,
-    WebhookQueue, Work,
+    BegunUpload, CancelReply, Claim, Claims, Created, EncodedResult, Ending, Error, Heartbeat, Hint, InputPage,
+    InputQuery, JobPage, JobQuery, Lease, Load, NewInput, NewRecord, NewUpload, PurgedUploads, QueueBounds,
+    QueueReport, RetryReply, Store, StoreStats, StoredInput, Swept, UploadBounds, UploadLease, UploadStatus,
+    WebhookOutcome, WebhookQueue, Work,
 };
 use crate::domain::InputName;
 use crate::domain::job::{Job, JobEvent, JobName};
@@ -54,26 +54,9 @@ impl<S: Store> Store for Timed<S> {
         self.0.events_after(name, after, limit).await
     }
 
-    async fn claim(&self, worker: &str, now: SystemTime, lease_for: Duration) -> Result<Option<Claimed>, Error> {
+    async fn claim(&self, claim: &Claim, now: SystemTime) -> Result<Claims, Error> {
         let _timer = store_operation("claim");
-        self.0.claim(worker, now, lease_for).await
-    }
-
-    async fn foresee(&self, passed: &[JobName], now: SystemTime) -> Result<Option<Claimed>, Error> {
-        let _timer = store_operation("foresee");
-        self.0.foresee(passed, now).await
-    }
-
-    async fn claim_foreseen(
-        &self,
-        foreseen: &Lease,
-        created: SystemTime,
-        worker: &str,
-        now: SystemTime,
-        lease_for: Duration,
-    ) -> Result<Option<Claimed>, Error> {
-        let _timer = store_operation("claim");
-        self.0.claim_foreseen(foreseen, created, worker, now, lease_for).await
+        self.0.claim(claim, now).await
     }
 
     async fn work(&self, name: &JobName) -> Result<Work, Error> {
@@ -300,8 +283,9 @@ mod tests {
             let directory = tempfile::tempdir().expect("a temporary directory");
             let store = Timed(Sqlite::open(directory.path()).await.expect("opens"));
             store.create_job(contract::record("a"), &contract::ROOM, contract::time(0)).await.expect("created");
-            let claimed = store.claim("w", contract::time(0), Duration::from_secs(1)).await.expect("claims");
-            let lease = claimed.expect("a job").lease;
+            let claim = Claim::one("w", Duration::from_secs(1));
+            let claims = store.claim(&claim, contract::time(0)).await.expect("claims");
+            let lease = claims.begun.expect("a job").lease;
             store.heartbeat(&lease, contract::time(0), Duration::from_secs(1)).await.expect("holds");
             store.sweep(contract::time(2), 3).await.expect("takes it back");
             store.heartbeat(&lease, contract::time(3), Duration::from_secs(1)).await.expect_err("too late");

@@ -208,7 +208,7 @@ class Client:
             tracks: The input; or an uploaded one, or its name.
             settings: How to solve. Left out: the server's defaults.
             labels: The caller's own marks of the job.
-            priority: Of the queued jobs, those of larger priority run first. -1000 to 1000.
+            priority: Of the tenant's queued jobs, those of larger priority run first. -1000 to 1000.
             time_limit: Seconds after which the server gives the job up.
             request_id: Makes the call safe to repeat. Left out: one is made.
             timeout: Seconds after which this call is given up, and the job cancelled.
@@ -255,7 +255,7 @@ class Client:
             tracks: The input; or an uploaded one, or its name.
             settings: How to solve. Left out: the server's defaults.
             labels: The caller's own marks of the job.
-            priority: Of the queued jobs, those of larger priority run first. -1000 to 1000.
+            priority: Of the tenant's queued jobs, those of larger priority run first. -1000 to 1000.
             time_limit: Seconds after which the server gives the job up.
             job_id: Last part of the job's name: 1 to 63 of a-z, 0-9 and `-`. Left out: the server chooses.
             request_id: Makes the call safe to repeat: the same id with the same input answers with the same job. Left

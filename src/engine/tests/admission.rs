@@ -120,7 +120,7 @@ async fn a_hundred_jobs_of_twenty_callers_on_two_workers_all_end() {
     names.sort();
     names.dedup();
     assert_eq!(names.len(), 100);
-    // One that is foreseen while another slot claims it may be begun for nothing.
+    // One that is prefetched while another slot begins it may be begun for nothing.
     assert!(bench.gate.calls.load(Ordering::SeqCst) >= 100);
     assert_eq!(bench.engine.load().await.expect("counts"), crate::engine::Load::default());
     eventually(|| async { (bench.engine.inner.hub.topic_count() == 0).then_some(()) }).await;

@@ -117,7 +117,7 @@ async fn a_deadline_ends_a_running_and_a_queued_job() {
 
 #[tokio::test]
 async fn priority_goes_before_age() {
-    // What is foreseen while one job is there goes first also where a more important one comes a moment later.
+    // What is prefetched while one job is there goes first also where a more important one comes a moment later.
     let bench = TestEngine::start(Options { short_job: Duration::ZERO, ..workers(1) }).await;
     let first = bench.submit(Script::Wait).await;
     bench.gate.until_waiting(1).await;

@@ -1,11 +1,12 @@
 //! The engine over a real SQLite store and a solver that does as it is told.
 
 mod admission;
-mod ahead;
 mod lifecycle;
+mod prefetch;
 mod sharing;
 mod simulation;
 mod survival;
+mod tenants;
 mod watching;
 
 use std::future::Future;

@@ -2,7 +2,7 @@
 
 use super::*;
 use crate::domain::job::AttachedCalls;
-use crate::store::TenantQueue;
+use crate::store::{Claims, TenantQueue};
 
 async fn retry(store: &dyn Store, name: &JobName, seconds: u64) -> Result<Job, Error> {
     store.retry_job(name, None, &ROOM, time(seconds)).await.map(|reply| reply.job)
@@ -136,12 +136,12 @@ pub(in crate::store) async fn a_paused_queue_gives_out_no_job(store: &dyn Store)
         assert_eq!(store.queue(1).await.expect("reports").pause_time, Some(time(3)), "since the first call");
     }
     assert!(store.load().await.expect("counts").paused);
-    assert_eq!(store.claim("worker", time(5), LEASE).await, Ok(None));
+    assert_eq!(store.claim(&Claim::one("worker", LEASE), time(5)).await, Ok(Claims::default()));
     // What runs goes on, and what is new is taken in.
     store.heartbeat(&lease, time(5), LEASE).await.expect("holds");
     store.finish(&lease, &success(vec![1]), time(6)).await.expect("finishes");
     create(store, record("c"), 6).await;
-    assert_eq!(store.claim("worker", time(7), LEASE).await, Ok(None));
+    assert_eq!(store.claim(&Claim::one("worker", LEASE), time(7)).await, Ok(Claims::default()));
     for seconds in [8, 9] {
         store.set_paused(false, time(seconds)).await.expect("resumes");
         assert_eq!(store.queue(1).await.expect("reports").pause_time, None);

@@ -1,7 +1,7 @@
 //! Leases: who may write, and where a job goes that ends, is given back or is lost.
 
 use super::*;
-use crate::store::Load;
+use crate::store::{Claims, Load, Prefetch};
 
 pub(in crate::store) async fn claims_go_by_priority_then_age(store: &dyn Store) {
     for (job, priority, seconds) in [("old", 0, 0), ("new", 0, 2), ("same", 0, 2), ("low", -1, 0), ("high", 5, 9)] {
@@ -16,59 +16,115 @@ pub(in crate::store) async fn claims_go_by_priority_then_age(store: &dyn Store) 
         assert_eq!(store.job(&claimed.job.name).await, Ok(claimed.job.clone()));
         assert_eq!(story(store, &claimed.job.name).await, told(&[(1, 0, "QUEUED"), (2, 1, "RUNNING")]));
     }
-    assert_eq!(store.claim("worker", time(20), LEASE).await, Ok(None));
+    assert_eq!(store.claim(&Claim::one("worker", LEASE), time(20)).await, Ok(Claims::default()));
 }
 
 pub(in crate::store) async fn no_job_is_claimed_twice(store: &dyn Store) {
     for number in 0..30 {
         create(store, record(&format!("job-{number}")), 0).await;
     }
-    let claims = futures_util::future::join_all((0..40).map(|_| store.claim("worker", time(1), LEASE))).await;
+    let claim = Claim::one("worker", LEASE);
+    let claims = futures_util::future::join_all((0..40).map(|_| store.claim(&claim, time(1)))).await;
     let mut names: Vec<_> =
-        claims.into_iter().filter_map(|claim| claim.expect("claims")).map(|claimed| claimed.job.name).collect();
+        claims.into_iter().filter_map(|claims| claims.expect("claims").begun).map(|claimed| claimed.job.name).collect();
     names.sort();
     names.dedup();
     assert_eq!(names.len(), 30);
 }
 
-pub(in crate::store) async fn a_foreseen_job_is_leased_unless_it_has_moved(store: &dyn Store) {
-    assert_eq!(store.foresee(&[], time(1)).await, Ok(None));
+/// How long a prefetched job is kept for its worker.
+const KEPT: Duration = Duration::from_secs(5);
+
+/// Claims the next job, or begins with one that was prefetched, and prefetches the one after it.
+async fn prefetching(store: &dyn Store, begin: Option<&Claimed>, seconds: u64) -> Claims {
+    let begin = begin.map(|prefetched| (prefetched.lease.clone(), prefetched.job.create_time));
+    let prefetch = Some(Prefetch { lease_for: KEPT, max_observations: record("").observation_count });
+    let claim = Claim { begin, prefetch, ..Claim::one("worker", LEASE) };
+    store.claim(&claim, time(seconds)).await.expect("claims")
+}
+
+pub(in crate::store) async fn a_prefetched_job_waits_until_it_is_begun(store: &dyn Store) {
+    assert_eq!(prefetching(store, None, 0).await, Claims::default());
     for (job, priority) in [("second", 0), ("first", 1), ("third", 0)] {
         create(store, NewRecord { priority, ..record(job) }, 0).await;
     }
-    create(store, NewRecord { deadline: Some(time(2)), priority: 9, ..record("late") }, 0).await;
-    let foreseen = store.foresee(&[], time(3)).await.expect("looks").expect("a job");
-    assert_eq!(foreseen.lease, Lease { name: record("first").name, attempt: 1 });
-    assert_eq!((foreseen.job.attempt, foreseen.queue_time, foreseen.job.create_time), (1, time(0), time(0)));
-    let next = store.foresee(std::slice::from_ref(&foreseen.lease.name), time(3)).await.expect("looks");
-    let second = next.expect("another").lease;
-    assert_eq!(second.name, record("second").name);
-    assert_eq!(story(store, &second.name).await, told(&[(1, 0, "QUEUED")]), "a look changes nothing");
+    let claims = prefetching(store, None, 1).await;
+    let [first, second] = [claims.begun, claims.prefetched].map(|claimed| claimed.expect("a job"));
+    assert_eq!((first.lease.name, first.job.state), (record("first").name, JobState::Running));
+    assert_eq!(second.lease, Lease { name: record("second").name, attempt: 1 });
+    assert_eq!((second.job.state, second.job.attempt, second.queue_time), (JobState::Queued, 0, time(0)));
+    assert_eq!(store.job(&second.job.name).await, Ok(second.job.clone()));
+    assert_eq!(story(store, &second.job.name).await, told(&[(1, 0, "QUEUED")]), "it is told to nobody");
+    let unbegun = Error::Fenced(second.lease.clone());
+    assert_eq!(store.heartbeat(&second.lease, time(1), LEASE).await, Err(unbegun.clone()));
+    assert_eq!(store.finish(&second.lease, &success(vec![1]), time(1)).await, Err(unbegun));
 
-    let claimed = store.claim_foreseen(&foreseen.lease, time(0), "worker", time(4), LEASE).await.expect("claims");
-    let claimed = claimed.expect("is still there");
-    assert_eq!((claimed.job.state, claimed.job.start_time), (JobState::Running, Some(time(4))));
-    assert_eq!(claimed.lease, foreseen.lease);
-    assert_eq!(store.job(&claimed.job.name).await, Ok(claimed.job.clone()));
-    assert_eq!(story(store, &claimed.job.name).await, told(&[(1, 0, "QUEUED"), (2, 1, "RUNNING")]));
+    let claims = prefetching(store, Some(&second), 2).await;
+    let [begun, third] = [claims.begun, claims.prefetched].map(|claimed| claimed.expect("a job"));
+    assert_eq!(
+        (&begun.lease, begun.job.state, begun.job.start_time),
+        (&second.lease, JobState::Running, Some(time(2)))
+    );
+    assert_eq!(story(store, &second.job.name).await, told(&[(1, 0, "QUEUED"), (2, 1, "RUNNING")]));
+    assert_eq!(third.lease.name, record("third").name);
+    assert_eq!(prefetching(store, Some(&second), 2).await, Claims::default(), "it runs");
+    let swept = store.sweep(time(1 + LEASE.as_secs()), MAX_ATTEMPTS).await.expect("sweeps").lost;
+    assert_eq!(swept.len(), 1, "{swept:?}");
+    assert_eq!((&*swept[0].name.job, swept[0].attempt), ("first", 1));
+    assert_eq!(store.job(&third.job.name).await, Ok(third.job), "no attempt was made");
+}
 
-    let again = async |lease: &Lease| store.claim_foreseen(lease, time(0), "other", time(5), LEASE).await;
-    assert_eq!(again(&foreseen.lease).await, Ok(None), "it runs");
-    store.release(&foreseen.lease, time(5)).await.expect("holds");
-    assert_eq!(again(&foreseen.lease).await, Ok(None), "that attempt is over");
-    let late = Lease { name: record("late").name, attempt: 1 };
-    assert_eq!(again(&late).await, Ok(None), "past its deadline");
-    store.request_cancel(&second.name, None, time(5)).await.expect("ends");
-    assert_eq!(again(&second).await, Ok(None), "it has ended");
-    assert_eq!(again(&Lease { name: record("none").name, attempt: 1 }).await, Ok(None));
-    store.delete_job(&second.name, None).await.expect("has ended");
-    create(store, record("second"), 6).await;
-    assert_eq!(again(&second).await, Ok(None), "it is another one of that name");
-    let both = futures_util::future::join_all((0..2).map(|_| {
-        let third = Lease { name: record("third").name, attempt: 1 };
-        async move { store.claim_foreseen(&third, time(0), "worker", time(6), LEASE).await.expect("claims") }
-    }));
-    assert_eq!(both.await.into_iter().flatten().count(), 1);
+pub(in crate::store) async fn a_prefetched_job_is_begun_by_whoever_comes_first(store: &dyn Store) {
+    for job in ["first", "second", "third"] {
+        create(store, record(job), 0).await;
+    }
+    let second = prefetching(store, None, 1).await.prefetched.expect("a job");
+    assert_eq!(second.lease.name, record("second").name);
+    assert_eq!(claim(store, 1).await.lease.name, record("third").name, "others pass over it");
+    assert_eq!(claim(store, 1).await.lease, second.lease, "but for one that finds no other job");
+    assert_eq!(prefetching(store, Some(&second), 1).await, Claims::default(), "it is another's");
+
+    // What is kept too long for its worker is in its place in the queue again.
+    for job in ["fourth", "fifth", "sixth"] {
+        create(store, record(job), 2).await;
+    }
+    let fifth = prefetching(store, None, 3).await.prefetched.expect("a job");
+    assert_eq!(claim(store, 3 + KEPT.as_secs()).await.lease, fifth.lease);
+    assert_eq!(prefetching(store, Some(&fifth), 3 + KEPT.as_secs()).await, Claims::default());
+
+    // Ended, and another job of that name: both are none that a worker has.
+    let sixth = prefetching(store, None, 20).await.begun.expect("a job");
+    assert_eq!(sixth.lease.name, record("sixth").name);
+    create(store, record("seventh"), 21).await;
+    create(store, record("eighth"), 22).await;
+    let eighth = prefetching(store, None, 23).await.prefetched.expect("a job");
+    let reply = store.request_cancel(&eighth.job.name, None, time(23)).await.expect("ends");
+    assert!(reply.ended_now, "it is queued");
+    assert_eq!(prefetching(store, Some(&eighth), 23).await, Claims::default());
+    store.delete_job(&eighth.job.name, None).await.expect("has ended");
+    create(store, record("seventh-again"), 24).await;
+    create(store, record("eighth"), 24).await;
+    let again = prefetching(store, None, 24).await.prefetched.expect("a job");
+    assert_eq!(again.lease, eighth.lease);
+    assert_eq!(prefetching(store, Some(&eighth), 24).await, Claims::default());
+    assert!(prefetching(store, Some(&again), 24).await.begun.is_some());
+}
+
+pub(in crate::store) async fn large_jobs_and_late_ones_are_not_prefetched(store: &dyn Store) {
+    create(store, record("first"), 0).await;
+    let large = NewRecord { observation_count: record("").observation_count + 1, ..record("large") };
+    create(store, large, 1).await;
+    create(store, record("small"), 2).await;
+    assert_eq!(prefetching(store, None, 3).await.prefetched, None, "nor is one prefetched in its place");
+    assert_eq!(claim(store, 3).await.job.name.job, "large");
+    create(store, NewRecord { deadline: Some(time(4)), priority: 1, ..record("late") }, 3).await;
+    create(store, record("last"), 3).await;
+    let claims = prefetching(store, None, 4).await;
+    assert_eq!(claims.begun.expect("a job").job.name.job, "small");
+    let last = claims.prefetched.expect("a job");
+    assert_eq!(last.job.name.job, "last");
+    let begun = prefetching(store, Some(&last), 4 + KEPT.as_secs()).await.begun;
+    assert_eq!(begun.map(|claimed| claimed.lease), Some(last.lease), "kept long, and still there");
 }
 
 pub(in crate::store) async fn a_lease_that_was_taken_over_writes_nothing(store: &dyn Store) {
@@ -194,7 +250,7 @@ pub(in crate::store) async fn giving_back_is_free_and_vanishing_is_not(store: &d
     assert!(failure.message.ends_with("6 by worker, 7 by worker, 8 by worker"), "{}", failure.message);
     let last = story(store, &name).await.pop().expect("events");
     assert_eq!(last.2, "FAILED:ATTEMPTS_EXHAUSTED");
-    assert_eq!(store.claim("worker", time(101), LEASE).await, Ok(None));
+    assert_eq!(store.claim(&Claim::one("worker", LEASE), time(101)).await, Ok(Claims::default()));
 }
 
 pub(in crate::store) async fn a_cancel_ends_what_waits_and_flags_what_runs(store: &dyn Store) {

@@ -5,6 +5,7 @@ pub(super) mod creation;
 pub(super) mod leases;
 pub(super) mod reading;
 pub(super) mod removal;
+pub(super) mod tenants;
 pub(super) mod uploads;
 pub(super) mod webhooks;
 
@@ -16,7 +17,7 @@ use crate::domain::job::{AttemptEnd, EventBody, Failure, Job, JobName, JobState,
 use crate::domain::{Progress, ReconstructionProgress, SolveSettings, Stage, Status, Step, Task};
 use crate::store::record::{Bound, NewRecord, QueueBounds, Request};
 use crate::store::{
-    ATTEMPTS_EXHAUSTED, Claimed, EncodedResult, Ending, Error, JobQuery, Lease, Order, Outcome, Store, payload,
+    ATTEMPTS_EXHAUSTED, Claim, Claimed, EncodedResult, Ending, Error, JobQuery, Lease, Order, Outcome, Store, payload,
 };
 
 /// Runs the contract: `$open` is an async function without arguments whose result, where the database is there, derefs
@@ -31,7 +32,9 @@ macro_rules! store_contract {
             creation::admission_bounds_what_waits,
             leases::claims_go_by_priority_then_age,
             leases::no_job_is_claimed_twice,
-            leases::a_foreseen_job_is_leased_unless_it_has_moved,
+            leases::a_prefetched_job_waits_until_it_is_begun,
+            leases::a_prefetched_job_is_begun_by_whoever_comes_first,
+            leases::large_jobs_and_late_ones_are_not_prefetched,
             leases::a_lease_that_was_taken_over_writes_nothing,
             leases::a_success_stores_its_result_then_its_state,
             leases::progress_is_an_event_and_stands_in_the_job,
@@ -39,6 +42,11 @@ macro_rules! store_contract {
             leases::giving_back_is_free_and_vanishing_is_not,
             leases::a_cancel_ends_what_waits_and_flags_what_runs,
             leases::deadlines_end_what_waits,
+            tenants::tenants_take_turns_and_priority_counts_within_one,
+            tenants::weights_are_shares,
+            tenants::an_idle_tenant_saves_nothing_up,
+            tenants::the_running_jobs_of_a_tenant_are_bounded,
+            tenants::a_bound_holds_however_many_claim_at_once,
             reading::listings_page_and_filter,
             reading::events_come_in_order_and_in_portions,
             reading::what_does_not_exist_is_not_found,
@@ -129,7 +137,7 @@ async fn create(store: &dyn Store, new: NewRecord, seconds: u64) -> Job {
 }
 
 async fn claim(store: &dyn Store, seconds: u64) -> Claimed {
-    store.claim("worker", time(seconds), LEASE).await.expect("claims").expect("a job waits")
+    store.claim(&Claim::one("worker", LEASE), time(seconds)).await.expect("claims").begun.expect("a job waits")
 }
 
 fn progress(iteration: u32) -> Progress {

@@ -1,13 +1,15 @@
 //! What several servers do to one input at once: nobody waits for ever, and nothing is left behind.
 
+use std::sync::Arc;
+
 use futures_util::future::join_all;
 
 use super::tests::Fixture;
 use super::*;
 use crate::store::contract::uploads::{ROOMY, finished, name, new};
 use crate::store::contract::{ROOM, record, time};
-use crate::store::record::{JobInput, NewRecord};
-use crate::store::{BegunUpload, Store};
+use crate::store::record::{JobInput, NewRecord, Prefetch, TenantShares};
+use crate::store::{BegunUpload, Claim, Store};
 
 /// Enough for orders of locks that differ to meet: without the one order, each of these tests fails within a few.
 const ROUNDS: u32 = 40;
@@ -88,5 +90,35 @@ async fn of_an_input_that_loses_its_name_and_its_last_job_at_once_nothing_is_lef
         let left = Statement::new("SELECT COUNT(*) AS count FROM inputs");
         let rows = fixture.reader(Size::Small).await.expect("a connection").rows(left).await.expect("counts");
         assert_eq!(sql::Row::integer(&rows[0], "count"), Ok(0), "round {round}");
+    }
+}
+
+#[tokio::test]
+async fn claims_of_several_tenants_meet_creations_and_cancels() {
+    let Some(fixture) = Fixture::open().await else { return };
+    let of = |tenant: &str, id: String| NewRecord { name: JobName { tenant: tenant.into(), job: id }, ..record("") };
+    let prefetch = Some(Prefetch { lease_for: Duration::from_secs(1), max_observations: u32::MAX });
+    for round in 0..ROUNDS {
+        // With a bound and without one.
+        let shares =
+            Arc::new(TenantShares { max_running: (round % 2 == 0).then_some(1_000), ..TenantShares::default() });
+        let claim = Claim { prefetch, shares, ..Claim::one("w", Duration::from_secs(30)) };
+        let creates = ["a", "b"].map(|tenant| {
+            let news = (0..3).map(|number| of(tenant, format!("{round}-{number}"))).collect();
+            async { fixture.create_jobs(news, &ROOM, time(1)).await.map(drop) }
+        });
+        assert!(join_all(creates).await.iter().all(Result::is_ok), "round {round}");
+        let claims = (0..3).map(|_| async {
+            let prefetched = fixture.claim(&claim, time(1)).await?.prefetched;
+            let begin = prefetched.map(|prefetched| (prefetched.lease, prefetched.job.create_time));
+            fixture.claim(&Claim { begin, ..claim.clone() }, time(1)).await.map(drop)
+        });
+        let cancels = ["a", "b"].map(|tenant| {
+            let name = of(tenant, format!("{round}-1")).name;
+            async { fixture.request_cancel(&{ name }, None, time(1)).await.map(drop) }
+        });
+        let more = async { fixture.create_job(of("c", round.to_string()), &ROOM, time(1)).await.map(drop) };
+        let (claimed, cancelled, created) = tokio::join!(join_all(claims), join_all(cancels), more);
+        assert!(claimed.iter().chain(&cancelled).chain([&created]).all(Result::is_ok), "round {round}: {claimed:?}");
     }
 }

@@ -20,7 +20,7 @@ use sqlx::postgres::{PgConnectOptions, PgConnection, PgPool, PgPoolOptions, PgRo
 use tokio::sync::Mutex;
 use tokio::time::timeout;
 
-use super::sql::{self, Change, Connection, Database, Moves, Operation, Size, Statement};
+use super::sql::{self, Change, Connection, Database, Lock, Moves, Operation, Size, Statement};
 use super::{Error, Hint};
 use crate::domain::job::JobName;
 use clock::Clock;
@@ -58,6 +58,8 @@ const SESSION: [(&str, &str); 6] = [
 
 /// Key of the advisory lock under which jobs are admitted: any constant does that others do not use, `scpsfm` in ASCII.
 const ADMISSION_LOCK: i64 = 0x7363_7073_666d;
+/// The same for claims that must not pass a bound together.
+const CLAIMS_LOCK: i64 = ADMISSION_LOCK + 1;
 
 /// Store in a PostgreSQL database.
 #[derive(Debug)]
@@ -139,8 +141,12 @@ impl Connection for PgConnection {
         sql::run::<sqlx::Postgres>(self, statement).await
     }
 
-    async fn lock_admission(&mut self) -> Result<(), Error> {
-        self.execute(Statement::new("SELECT pg_advisory_xact_lock($1)").bind(ADMISSION_LOCK)).await
+    async fn take_lock(&mut self, lock: Lock) -> Result<(), Error> {
+        let key = match lock {
+            Lock::Admission => ADMISSION_LOCK,
+            Lock::Claims => CLAIMS_LOCK,
+        };
+        self.execute(Statement::new("SELECT pg_advisory_xact_lock($1)").bind(key)).await
     }
 
     async fn tell(&mut self, change: Change, job: &JobName) -> Result<(), Error> {

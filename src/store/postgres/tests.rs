@@ -10,7 +10,7 @@ use std::sync::Arc;
 use super::*;
 use crate::domain::job::JobState;
 use crate::store::sql::Row;
-use crate::store::{Store, contract};
+use crate::store::{Claim, Store, contract};
 use cluster::Cluster;
 
 /// A store in a database of its own, in a cluster that lives as long as a test needs it.
@@ -45,7 +45,7 @@ async fn what_lives_elsewhere_is_not_taken_back_at_a_start() {
     let Some(fixture) = Fixture::open().await else { return };
     let now = contract::time(1);
     fixture.create_job(contract::record("a"), &contract::ROOM, now).await.expect("created");
-    let claimed = fixture.claim("w", now, LEASE).await.expect("claims").expect("a job");
+    let claimed = fixture.claim(&Claim::one("w", LEASE), now).await.expect("claims").begun.expect("a job");
     let other = Postgres::open(&fixture.url).await.expect("a second server");
     assert_eq!(other.recover(contract::time(30), 3).await, Ok(Vec::new()), "the lease has a second to go");
     fixture.heartbeat(&claimed.lease, contract::time(30), LEASE).await.expect("still holds");
@@ -73,7 +73,8 @@ async fn a_server_whose_clock_is_wrong_takes_and_loses_nothing_early() {
     // Its clock is an hour behind the database's: its second 0 is everyone's second 3600.
     fixture.clock.pretend(Duration::from_secs(3600));
     fixture.create_job(contract::record("a"), &contract::ROOM, contract::time(0)).await.expect("created");
-    let claimed = fixture.claim("w", contract::time(0), LEASE).await.expect("claims").expect("a job");
+    let claimed =
+        fixture.claim(&Claim::one("w", LEASE), contract::time(0)).await.expect("claims").begun.expect("a job");
     assert!(right.sweep(contract::time(3629), 3).await.expect("sweeps").lost.is_empty(), "a second to go");
     fixture.heartbeat(&claimed.lease, contract::time(10), LEASE).await.expect("holds");
     assert!(right.sweep(contract::time(3639), 3).await.expect("sweeps").lost.is_empty(), "a second to go");
@@ -105,12 +106,13 @@ async fn many_servers_share_one_queue_and_one_set_of_request_ids() {
     assert_eq!(requests, 10, "one request id is one job");
     assert_eq!(fixture.load().await.expect("counts").queued, 10);
 
+    let claim = &Claim::one("w", LEASE);
     let claims = (0..30).map(|number| {
         let server = &servers[number % 3];
-        persistent(move || server.claim("w", contract::time(1), LEASE))
+        persistent(move || server.claim(claim, contract::time(1)))
     });
     let claims = futures_util::future::join_all(claims).await;
-    let claimed = claims.into_iter().filter_map(|claim| claim.expect("claims")).map(|claimed| claimed.job.name);
+    let claimed = claims.into_iter().filter_map(|claims| claims.expect("claims").begun).map(|claimed| claimed.job.name);
     told_once(claimed.collect());
     let load = fixture.load().await.expect("counts");
     assert_eq!((load.queued, load.running), (0, 10));
@@ -162,7 +164,7 @@ async fn changes_are_told_to_other_servers_by_name_and_after_the_commit() {
     let told = [other.hint().await, other.hint().await];
     assert_eq!(told, [Hint::Events(name.clone()), Hint::Queued]);
     assert_eq!(other.job(&name).await.expect("is there").last_sequence, 1);
-    fixture.claim("w", contract::time(1), LEASE).await.expect("claims").expect("a job");
+    fixture.claim(&Claim::one("w", LEASE), contract::time(1)).await.expect("claims").begun.expect("a job");
     assert_eq!(other.hint().await, Hint::Events(name.clone()));
     fixture.request_cancel(&name, None, contract::time(2)).await.expect("flags");
     assert_eq!(other.hint().await, Hint::Cancel(name));
@@ -173,7 +175,7 @@ async fn a_server_that_stops_within_a_transaction_holds_up_nobody_for_long() {
     let Some(fixture) = Fixture::open().await else { return };
     let other = Postgres::open(&fixture.url).await.expect("a second server");
     let mut stuck = other.pool(Size::Small).begin().await.expect("a transaction");
-    stuck.lock_admission().await.expect("the lock");
+    stuck.take_lock(Lock::Admission).await.expect("the lock");
     // Only the database itself can end this one: its bound is below what a creation may take.
     fixture.create_job(contract::record("a"), &contract::ROOM, contract::time(0)).await.expect("created in the end");
     assert!(stuck.rows(Statement::new("SELECT 1")).await.is_err(), "it was ended");

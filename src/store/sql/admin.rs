@@ -5,7 +5,7 @@ use std::time::SystemTime;
 use super::jobs::{self, Waiting};
 use super::removal::check_etag;
 use super::rows::{self, Departure, leave, micros, number, returning_job, standing};
-use super::{Change, Connection, Row, Statement, webhooks};
+use super::{Change, Connection, Lock, Row, Statement, webhooks};
 use crate::domain::job::{Job, JobName, JobState};
 use crate::store::Error;
 use crate::store::record::{QueueBounds, QueueReport, RetryReply, TenantQueue};
@@ -19,7 +19,7 @@ pub(super) async fn retry<C: Connection>(
     now: SystemTime,
 ) -> Result<RetryReply, Error> {
     // Before the job's row, as whoever creates jobs takes them: two in the other order would wait for each other.
-    connection.lock_admission().await?;
+    connection.take_lock(Lock::Admission).await?;
     let job = standing(connection, name).await?;
     check_etag(connection, name, etag).await?;
     match job.state {

@@ -1,134 +1,20 @@
-//! Leases: claiming, keeping, ending and losing them.
+//! Leases: keeping, ending and losing them. `claims` is where they begin.
 
 use std::time::SystemTime;
 
 use super::rows::{
-    self, Departure, Standing, end_attempt, held, insert_event, integer, leave, micros, number, returning_job,
-    select_jobs, select_standing, standing,
+    self, Departure, Standing, end_attempt, held, insert_event, integer, leave, micros, number, select_standing,
+    standing,
 };
 use super::{Change, Connection, Row, Statement, jobs, removal};
 use crate::domain::job::{AttemptEnd, EventBody, Failure, Job, JobName, JobState, PastAttempt};
 use crate::domain::progress::Progress;
-use crate::store::record::{CancelReply, Claimed, Ending, Heartbeat, Lease, Outcome};
+use crate::store::record::{CancelReply, Ending, Heartbeat, Lease, Outcome};
 use crate::store::{ATTEMPTS_EXHAUSTED, Error, payload};
 
 /// Attempts that a failure tells of, the latest ones: those given back at a drain do not count against the cap, and
 /// there is no bound on them.
 const MOST_PAST_ATTEMPTS: u32 = 16;
-
-/// Whether anything is queued that may be claimed.
-pub(super) async fn may_claim<C: Connection>(connection: &mut C) -> Result<bool, Error> {
-    let select = Statement::new(
-        "SELECT EXISTS (SELECT 1 FROM jobs WHERE state = 'QUEUED' AND (SELECT pause_time FROM queue) IS NULL) AS found",
-    );
-    connection.row(select).await?.flag("found")
-}
-
-/// Leases the next queued job until `expires`.
-pub(super) async fn claim<C: Connection>(
-    connection: &mut C,
-    worker: &str,
-    now: SystemTime,
-    expires: SystemTime,
-) -> Result<Option<Claimed>, Error> {
-    let next = Statement::new(select_standing!(
-        "WHERE state = 'QUEUED' AND (deadline IS NULL OR deadline > $1) AND (SELECT pause_time FROM queue) IS NULL \
-         ORDER BY priority DESC, create_time, id LIMIT 1"
-    ))
-    .bind(micros(now))
-    .then(C::SKIP_LOCKED);
-    lease(connection, next, worker, now, expires).await
-}
-
-/// The job that a claim would lease next, but for some; see [`crate::store::Store::foresee`].
-pub(super) async fn foresee<C: Connection>(
-    connection: &mut C,
-    passed: &[JobName],
-    now: SystemTime,
-) -> Result<Option<Claimed>, Error> {
-    let next = Statement::new(select_jobs!(
-        "WHERE state = 'QUEUED' AND (deadline IS NULL OR deadline > $1) AND (SELECT pause_time FROM queue) IS NULL \
-         ORDER BY priority DESC, create_time, id LIMIT $2"
-    ))
-    .bind(micros(now))
-    .bind(integer(passed.len() as u64 + 1));
-    for row in connection.rows(next).await? {
-        let mut claimed = claimed(&row)?;
-        if !passed.contains(&claimed.job.name) {
-            claimed.lease.attempt += 1;
-            claimed.job.attempt = claimed.lease.attempt;
-            return Ok(Some(claimed));
-        }
-    }
-    Ok(None)
-}
-
-/// Leases a job that was foreseen; see [`crate::store::Store::claim_foreseen`].
-pub(super) async fn claim_foreseen<C: Connection>(
-    connection: &mut C,
-    foreseen: &Lease,
-    created: SystemTime,
-    worker: &str,
-    now: SystemTime,
-    expires: SystemTime,
-) -> Result<Option<Claimed>, Error> {
-    let same = Statement::new(select_standing!(
-        "WHERE tenant = $1 AND job = $2 AND attempt = $3 AND create_time = $4 AND state = 'QUEUED' \
-         AND (deadline IS NULL OR deadline > $5) AND (SELECT pause_time FROM queue) IS NULL"
-    ))
-    .bind(&foreseen.name.tenant)
-    .bind(&foreseen.name.job)
-    .bind(foreseen.attempt.saturating_sub(1))
-    .bind(micros(created))
-    .bind(micros(now))
-    .then(C::SKIP_LOCKED);
-    lease(connection, same, worker, now, expires).await
-}
-
-/// Leases the job of this row, if there is one.
-async fn lease<C: Connection>(
-    connection: &mut C,
-    standing: Statement,
-    worker: &str,
-    now: SystemTime,
-    expires: SystemTime,
-) -> Result<Option<Claimed>, Error> {
-    let Some(row) = connection.optional_row(standing).await? else { return Ok(None) };
-    let job = Standing::from_row(&row)?;
-    let (attempt, sequence) = (job.attempt + 1, job.last_sequence + 1);
-    let lease = Statement::new(returning_job!(
-        "UPDATE jobs SET state = 'RUNNING', attempt = $1, start_time = COALESCE(start_time, $2), lease_worker = $3, \
-         lease_expires = $4, progress = NULL, last_sequence = $5 WHERE id = $6"
-    ))
-    .bind(attempt)
-    .bind(micros(now))
-    .bind(worker)
-    .bind(micros(expires))
-    .bind(integer(sequence))
-    .bind(job.id);
-    let begin = Statement::new("INSERT INTO attempts (job_id, attempt, worker, start_time) VALUES ($1, $2, $3, $4)")
-        .bind(job.id)
-        .bind(attempt)
-        .bind(worker)
-        .bind(micros(now));
-    let event = EventBody::State { state: JobState::Running, failure: None };
-    let event = insert_event(job.id, sequence, attempt, &event, now)?;
-    let rows = connection.batch(vec![lease, begin, event]).await?;
-    connection.tell(Change::Events, &job.name).await?;
-    let changed = rows.first().ok_or_else(|| Error::Corrupt("a job that was just leased is not there".into()))?;
-    claimed(changed).map(Some)
-}
-
-/// A job with the lease of its latest attempt, from a row of `select_jobs!`.
-fn claimed(row: &impl Row) -> Result<Claimed, Error> {
-    let job = rows::job(row)?;
-    Ok(Claimed {
-        lease: Lease { name: job.name.clone(), attempt: job.attempt },
-        job,
-        trace_parent: row.optional_text("trace_parent")?,
-        queue_time: rows::time(row.integer("queue_time")?),
-    })
-}
 
 /// Extends a lease until `expires`.
 pub(super) async fn heartbeat<C: Connection>(

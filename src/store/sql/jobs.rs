@@ -1,10 +1,10 @@
 //! Creating, reading and listing jobs.
 
-use std::collections::{HashMap, HashSet};
+use std::collections::{BTreeSet, HashMap, HashSet};
 use std::time::SystemTime;
 
 use super::rows::{self, integer, micros, number, returning_job, select_jobs};
-use super::{Change, Connection, Row, Statement, uploads, webhooks};
+use super::{Change, Connection, Lock, Row, Statement, fairness, uploads, webhooks};
 use crate::domain::job::{EventBody, Job, JobEvent, JobName, JobState};
 use crate::domain::{InputName, Webhook};
 use crate::store::record::{
@@ -35,7 +35,7 @@ pub(super) async fn create<C: Connection>(
                 *input = Some(input_of(connection, new, now).await?);
             }
         }
-        connection.lock_admission().await?;
+        connection.take_lock(Lock::Admission).await?;
         // Looked over again below: others may have come in between.
         waiting = Waiting::default();
     }
@@ -58,6 +58,10 @@ pub(super) async fn create<C: Connection>(
                 waiting.add(new);
             }
         }
+    }
+    let fresh = created.iter().filter(|created| created.new).map(|created| created.job.name.tenant.as_str());
+    for tenant in fresh.collect::<BTreeSet<_>>() {
+        fairness::register(connection, tenant).await?;
     }
     Ok(created)
 }

@@ -4,6 +4,8 @@
 
 mod admin;
 mod attempts;
+mod claims;
+mod fairness;
 mod jobs;
 mod removal;
 mod rows;
@@ -38,8 +40,8 @@ pub(super) trait Connection: Send {
     /// Runs a statement to its end and returns its rows.
     fn rows(&mut self, statement: Statement) -> impl Future<Output = Result<Vec<Self::Row>, Error>> + Send;
 
-    /// Waits until no other transaction admits jobs, and keeps others from it until this one ends.
-    fn lock_admission(&mut self) -> impl Future<Output = Result<(), Error>> + Send {
+    /// Waits until no other transaction has the lock, and keeps it until this one ends.
+    fn take_lock(&mut self, _lock: Lock) -> impl Future<Output = Result<(), Error>> + Send {
         std::future::ready(Ok(()))
     }
 
@@ -76,6 +78,15 @@ pub(super) trait Connection: Send {
     fn execute(&mut self, statement: Statement) -> impl Future<Output = Result<(), Error>> + Send {
         async { self.rows(statement).await.map(drop) }
     }
+}
+
+/// What one transaction at a time may do, where writing is not that by itself.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(super) enum Lock {
+    /// Admit jobs: the bounds of the queue hold over all servers.
+    Admission,
+    /// Claim jobs, where there is a bound on those of a tenant that run.
+    Claims,
 }
 
 /// What other processes are told of a job.

@@ -133,6 +133,7 @@ pub(super) struct Standing {
     pub deadline: Option<SystemTime>,
     /// Number of its latest event.
     pub last_sequence: u64,
+    pub observation_count: u32,
 }
 
 impl Standing {
@@ -147,6 +148,7 @@ impl Standing {
             cancel_requested: row.flag("cancel_requested")?,
             deadline: optional_time(row, "deadline")?,
             last_sequence: number(row, "last_sequence")?,
+            observation_count: number(row, "observation_count")?,
         })
     }
 }
@@ -181,8 +183,8 @@ pub(super) fn page<R: Row>(
 macro_rules! select_standing {
     ($clauses:literal) => {
         concat!(
-            "SELECT id, tenant, job, state, attempt, lost_attempts, cancel_requested, deadline, last_sequence ",
-            "FROM jobs ",
+            "SELECT id, tenant, job, state, attempt, lost_attempts, cancel_requested, deadline, last_sequence, ",
+            "observation_count FROM jobs ",
             $clauses
         )
     };

@@ -6,12 +6,12 @@ use std::time::{Duration, SystemTime};
 
 use futures_util::FutureExt;
 
-use super::{Database, Moves, Size, admin, attempts, jobs, operation, removal, uploads, webhooks};
+use super::{Database, Moves, Size, admin, attempts, claims, jobs, operation, removal, uploads, webhooks};
 use crate::domain::InputName;
 use crate::domain::job::{Job, JobEvent, JobName};
 use crate::domain::progress::Progress;
 use crate::store::record::{
-    CancelReply, Claimed, Created, EncodedResult, Ending, Heartbeat, JobInput, Lease, Load, NewRecord, Outcome,
+    CancelReply, Claim, Claims, Created, EncodedResult, Ending, Heartbeat, JobInput, Lease, Load, NewRecord, Outcome,
     QueueBounds, QueueReport, RetryReply, StoreStats, Swept, WebhookOutcome, WebhookQueue, Work,
 };
 use crate::store::upload::{
@@ -92,34 +92,15 @@ impl<D: Database> Store for D {
         reads!(self, Size::Small, |connection| jobs::events_after(connection, name, after, limit))
     }
 
-    async fn claim(&self, worker: &str, now: SystemTime, lease_for: Duration) -> Result<Option<Claimed>, Error> {
-        let expires = self.lease_clock(now) + lease_for;
+    async fn claim(&self, claim: &Claim, now: SystemTime) -> Result<Claims, Error> {
         // Idle workers look for jobs again and again: a read is one question over the network, a transaction is three.
-        if D::SHARED && !reads!(self, Size::Small, |connection| attempts::may_claim(connection))? {
-            return Ok(None);
+        if D::SHARED && claim.begin.is_none() && !reads!(self, Size::Small, |connection| claims::may_claim(connection))?
+        {
+            return Ok(Claims::default());
         }
-        let worker = worker.to_owned();
-        writes!(self, Size::Small, Moves::Begins(0), [worker], |connection| attempts::claim(
-            connection, &worker, now, expires
-        ))
-    }
-
-    async fn foresee(&self, passed: &[JobName], now: SystemTime) -> Result<Option<Claimed>, Error> {
-        reads!(self, Size::Small, |connection| attempts::foresee(connection, passed, now))
-    }
-
-    async fn claim_foreseen(
-        &self,
-        foreseen: &Lease,
-        created: SystemTime,
-        worker: &str,
-        now: SystemTime,
-        lease_for: Duration,
-    ) -> Result<Option<Claimed>, Error> {
-        let expires = self.lease_clock(now) + lease_for;
-        let worker = worker.to_owned();
-        writes!(self, Size::Small, Moves::Begins(0), [foreseen, worker], |connection| attempts::claim_foreseen(
-            connection, &foreseen, created, &worker, now, expires
+        let lease_now = self.lease_clock(now);
+        writes!(self, Size::Small, Moves::Begins(0), [claim], |connection| claims::claim(
+            connection, &claim, now, lease_now
         ))
     }
 

@@ -4,7 +4,7 @@ use std::collections::BTreeSet;
 use std::time::SystemTime;
 
 use super::rows::{self, integer, micros, number};
-use super::{Connection, Row, Statement, jobs};
+use super::{Connection, Lock, Row, Statement, jobs};
 use crate::domain::input_name::InputName;
 use crate::store::upload::{
     BegunUpload, NewInput, NewUpload, PurgedUploads, StoredInput, UploadBounds, UploadLease, UploadStatus,
@@ -88,7 +88,7 @@ pub(super) async fn begin<C: Connection>(
         return Ok(BegunUpload::Finished(input));
     }
     // Of two that begin the same one, or that share the last room, one waits for the other.
-    connection.lock_admission().await?;
+    connection.take_lock(Lock::Admission).await?;
     let Some(upload) = find(connection, &new.name, true).await? else {
         return open(connection, new, bounds, now).await;
     };

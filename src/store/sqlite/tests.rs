@@ -8,7 +8,7 @@ use tokio::task::JoinHandle;
 use super::*;
 use crate::domain::job::JobState;
 use crate::store::sql::Row;
-use crate::store::{Store, contract};
+use crate::store::{Claim, Store, contract};
 
 /// A store in a directory that lives as long as the test.
 pub(super) struct Fixture {
@@ -97,7 +97,8 @@ async fn everything_is_there_after_a_reopen_and_every_lease_is_a_dead_one() {
     let now = contract::time(1);
     let store = Sqlite::open(directory.path()).await.expect("opens");
     store.create_job(contract::record("a"), &contract::ROOM, now).await.expect("created");
-    let claimed = store.claim("w", now, Duration::from_secs(3600)).await.expect("claims").expect("a job");
+    let claimed =
+        store.claim(&Claim::one("w", Duration::from_secs(3600)), now).await.expect("claims").begun.expect("a job");
     let events = store.events_after(&claimed.job.name, 0, 10).await.expect("events");
     drop(store);
 

@@ -13,7 +13,7 @@ use super::check::result_of;
 use super::{MAX_ATTEMPTS, MAX_JOBS, Plan};
 use crate::engine::drain::Threads;
 use crate::engine::tests::{input, progress, solution};
-use crate::engine::worker::{Assignment, Worker};
+use crate::engine::worker::{Assigned, Worker};
 use crate::engine::{Clock, Drained, Engine, Error, Options};
 use crate::store::simulated::{Faults, Link, Simulated};
 
@@ -157,7 +157,7 @@ impl Server {
 }
 
 /// A worker: what its thread is in earnest.
-async fn work(mut inbox: mpsc::Receiver<Assignment>, dead: Arc<AtomicBool>) {
+async fn work(mut inbox: mpsc::Receiver<Assigned>, dead: Arc<AtomicBool>) {
     while let Some(assignment) = inbox.recv().await {
         let seed = assignment.settings().seed;
         let step = Behavior::duration(seed) / 4;

@@ -43,6 +43,8 @@ CREATE TABLE jobs (
     attempt           INTEGER NOT NULL DEFAULT 0,
     -- Attempts whose worker vanished: what the cap on attempts counts.
     lost_attempts     INTEGER NOT NULL DEFAULT 0,
+    -- The lease of a running job. A queued one has a lease while a worker has prefetched it: other claims pass over it
+    -- until that expires.
     lease_worker      TEXT,
     lease_expires     INTEGER,
     cancel_requested  INTEGER NOT NULL DEFAULT 0,
@@ -75,15 +77,16 @@ CREATE TABLE jobs (
     -- Those of them that were disconnected since.
     detached_calls    INTEGER NOT NULL DEFAULT 0,
     UNIQUE (tenant, job),
-    CHECK ((state = 'RUNNING') = (lease_expires IS NOT NULL))
+    CHECK (state <> 'RUNNING' OR lease_expires IS NOT NULL),
+    CHECK (state IN ('QUEUED', 'RUNNING') OR lease_expires IS NULL)
 ) STRICT;
 
--- The order of claims.
-CREATE INDEX jobs_queue ON jobs (priority DESC, create_time, id) WHERE state = 'QUEUED';
+-- Which tenants wait, and the order of claims within one.
+CREATE INDEX jobs_queue ON jobs (tenant, priority DESC, create_time, id) WHERE state = 'QUEUED';
 -- Covers what admission sums.
 CREATE INDEX jobs_load ON jobs (state, input_bytes, observation_count) WHERE state IN ('QUEUED', 'RUNNING');
 CREATE INDEX jobs_deadline ON jobs (deadline) WHERE state = 'QUEUED' AND deadline IS NOT NULL;
-CREATE INDEX jobs_lease ON jobs (lease_expires) WHERE state = 'RUNNING';
+CREATE INDEX jobs_lease ON jobs (state, lease_expires) WHERE lease_expires IS NOT NULL;
 -- The order of listings. Jobs of one microsecond go by their ids, which are their tenant's own: the number of the row
 -- would tell in a page token how many jobs all tenants have made.
 CREATE INDEX jobs_listing ON jobs (tenant, create_time, job);
@@ -99,6 +102,13 @@ CREATE TABLE queue (
     pause_time INTEGER
 ) STRICT;
 INSERT INTO queue (id) VALUES (1);
+
+-- Tenants that ever had a job, and where each stands in the round of claims: the virtual time at which its latest job
+-- began. See `store/sql/fairness.rs`.
+CREATE TABLE tenants (
+    tenant        TEXT    PRIMARY KEY NOT NULL,
+    virtual_start INTEGER NOT NULL DEFAULT 0
+) STRICT, WITHOUT ROWID;
 
 -- The labels once more, for filters.
 CREATE TABLE job_labels (

@@ -1,4 +1,4 @@
-//! Jobs that are begun the moment a worker is free: read ahead, leased while they are solved, and nothing before.
+//! Jobs that are begun the moment a worker is free: leased and loaded ahead, and queued until then.
 
 use std::pin::pin;
 use std::time::SystemTime;
@@ -7,13 +7,13 @@ use futures_util::FutureExt;
 
 use super::*;
 use crate::engine::{Drained, locked};
-use crate::store::Lease;
+use crate::store::{Claim, Lease};
 
 /// Every job counts as short.
 const ALWAYS: Duration = Duration::from_secs(3_600);
 
 /// One worker on a job that runs until the gate opens, and another job that is in its hands behind it.
-async fn foreseen() -> (TestEngine, [JobName; 2]) {
+async fn prefetched() -> (TestEngine, [JobName; 2]) {
     let bench = TestEngine::start(Options { short_job: ALWAYS, ..workers(1) }).await;
     let both = vec![new_job(Script::Wait), new_job(Script::Succeed)];
     let created = bench.engine.submit_batch(both).await.expect("admitted");
@@ -24,20 +24,19 @@ async fn foreseen() -> (TestEngine, [JobName; 2]) {
 
 /// Until the second of two jobs is in the hands of the worker that solves the first one.
 async fn handed_over(bench: &TestEngine, second: &JobName) {
-    eventually(|| async { is_foreseen(bench, second).then_some(()) }).await;
-    // It is foreseen before its input is read. What follows an attempt begins with handing it over.
+    eventually(|| async { is_prefetched(bench, second).then_some(()) }).await;
+    // It is listed before its input is read. What follows an attempt begins with handing it over.
     eventually(|| async { (bench.engine.inner.hub.topic_count() == 2).then_some(()) }).await;
 }
 
-/// Until nothing is foreseen or running. A job's end is in the store a little before its attempt is off the list.
+/// Until nothing is prefetched or running. A job's end is in the store a little before its attempt is off the list.
 async fn nothing_is_left(bench: &TestEngine) {
-    let inner = &bench.engine.inner;
-    eventually(|| async { (locked(&inner.foreseen).is_empty() && locked(&inner.running).is_empty()).then_some(()) })
-        .await;
+    eventually(|| async { locked(&bench.engine.inner.running).is_empty().then_some(()) }).await;
 }
 
-fn is_foreseen(bench: &TestEngine, name: &JobName) -> bool {
-    locked(&bench.engine.inner.foreseen).contains_key(name)
+/// Whether a job that does not run is in a worker's hands, or on its way there.
+fn is_prefetched(bench: &TestEngine, name: &JobName) -> bool {
+    locked(&bench.engine.inner.running).keys().any(|lease| lease.name == *name)
 }
 
 /// The states that a job has been in.
@@ -52,8 +51,8 @@ async fn states(bench: &TestEngine, name: &JobName) -> Vec<JobState> {
 }
 
 #[tokio::test]
-async fn a_foreseen_job_waits_as_any_other_and_is_solved_next() {
-    let (bench, names) = foreseen().await;
+async fn a_prefetched_job_waits_as_any_other_and_is_solved_next() {
+    let (bench, names) = prefetched().await;
     let waiting = bench.engine.job(&names[1]).await.expect("exists");
     assert_eq!((waiting.state, waiting.attempt, waiting.last_sequence), (JobState::Queued, 0, 1), "nothing is told");
     bench.gate.open();
@@ -68,13 +67,13 @@ async fn a_foreseen_job_waits_as_any_other_and_is_solved_next() {
 }
 
 #[tokio::test]
-async fn behind_a_job_that_turns_out_long_nothing_is_foreseen_any_more() {
+async fn behind_a_job_that_turns_out_long_nothing_is_prefetched_any_more() {
     let bench = TestEngine::start(Options { short_job: Duration::from_secs(2), ..workers(1) }).await;
     let both = vec![new_job(Script::Wait), new_job(Script::Succeed)];
     let created = bench.engine.submit_batch(both).await.expect("admitted");
     let next = &created[1].name;
-    eventually(|| async { is_foreseen(&bench, next).then_some(()) }).await;
-    eventually(|| async { (!is_foreseen(&bench, next)).then_some(()) }).await;
+    eventually(|| async { is_prefetched(&bench, next).then_some(()) }).await;
+    eventually(|| async { (!is_prefetched(&bench, next)).then_some(()) }).await;
     assert_eq!(bench.engine.job(&created[0].name).await.expect("exists").state, JobState::Running);
     assert_eq!(bench.engine.job(next).await.expect("exists").state, JobState::Queued);
     bench.gate.open();
@@ -84,8 +83,8 @@ async fn behind_a_job_that_turns_out_long_nothing_is_foreseen_any_more() {
 }
 
 #[tokio::test]
-async fn cancelled_before_it_is_begun_it_ends_so_whatever_was_foreseen() {
-    let (bench, [solved, next]) = foreseen().await;
+async fn cancelled_before_it_is_begun_it_ends_so_whoever_has_it() {
+    let (bench, [solved, next]) = prefetched().await;
     assert_eq!(bench.engine.cancel(&next).await.expect("exists").state, JobState::Cancelled);
     let third = bench.submit(Script::Succeed).await;
     bench.gate.open();
@@ -99,7 +98,7 @@ async fn cancelled_before_it_is_begun_it_ends_so_whatever_was_foreseen() {
 /// The worker begins it, and solves it, while the claim waits behind the cancel.
 #[tokio::test]
 async fn cancelled_between_its_begin_and_its_lease_it_leaves_nothing() {
-    let (bench, [solved, next]) = foreseen().await;
+    let (bench, [solved, next]) = prefetched().await;
     let (go, held) = bench.store.hold().await;
     let mut cancelling = pin!(bench.engine.inner.cancel(&next, None));
     // Polled once, it is in the writer's queue.
@@ -130,7 +129,7 @@ async fn what_was_begun_and_cannot_be_leased_is_stopped_and_solved_later() {
     bench.engine.cancel(first).await.expect("exists");
     bench.gate.until_waiting(2).await;
     // It is until its claim has failed.
-    eventually(|| async { (!is_foreseen(&bench, next)).then_some(()) }).await;
+    eventually(|| async { (!is_prefetched(&bench, next)).then_some(()) }).await;
     assert_eq!(bench.ended(first).await.state, JobState::Cancelled);
     assert_eq!(states(&bench, next).await, [JobState::Queued]);
     bench.store.execute("DROP TRIGGER broken").await;
@@ -142,10 +141,10 @@ async fn what_was_begun_and_cannot_be_leased_is_stopped_and_solved_later() {
 
 #[tokio::test]
 async fn taken_by_another_process_it_stays_with_that() {
-    let (bench, [solved, next]) = foreseen().await;
+    let (bench, [solved, next]) = prefetched().await;
     let (now, lease_for) = (SystemTime::now(), Duration::from_secs(3_600));
-    let claimed = bench.store.claim("another", now, lease_for).await.expect("claims").expect("a job");
-    assert_eq!(claimed.job.name, next);
+    let claims = bench.store.claim(&Claim::one("another", lease_for), now).await.expect("claims");
+    assert_eq!(claims.begun.expect("a job").job.name, next, "the other process is idle");
     bench.gate.open();
     assert_eq!(bench.ended(&solved).await.state, JobState::Succeeded);
     let third = bench.submit(Script::Succeed).await;
@@ -156,7 +155,7 @@ async fn taken_by_another_process_it_stays_with_that() {
 
 #[tokio::test]
 async fn a_drain_leaves_it_in_the_queue() {
-    let (bench, [solved, next]) = foreseen().await;
+    let (bench, [solved, next]) = prefetched().await;
     let engine = bench.engine.clone();
     let drain = tokio::spawn(async move { engine.drain(Duration::from_secs(120)).await });
     eventually(|| async { bench.engine.is_draining().then_some(()) }).await;

@@ -1,0 +1,179 @@
+//! Claims: the next job is begun, and the one after it prefetched.
+//!
+//! A prefetched job is queued and has a lease. It is begun by whoever comes first: the worker that has it in its hands,
+//! one that finds no other job, or anyone once the lease has expired.
+
+use std::time::SystemTime;
+
+use super::rows::{self, Standing, insert_event, integer, micros, returning_job, select_standing};
+use super::{Change, Connection, Lock, Row, Statement, fairness};
+use crate::domain::job::{EventBody, JobState};
+use crate::store::Error;
+use crate::store::record::{Claim, Claimed, Claims, Lease, Prefetch};
+
+/// Whether anything is queued that may be begun.
+pub(super) async fn may_claim<C: Connection>(connection: &mut C) -> Result<bool, Error> {
+    let select = Statement::new(
+        "SELECT EXISTS (SELECT 1 FROM jobs WHERE state = 'QUEUED' AND (SELECT pause_time FROM queue) IS NULL) AS found",
+    );
+    connection.row(select).await?.flag("found")
+}
+
+/// See [`crate::store::Store::claim`].
+///
+/// * `lease_now`: now, on the clock of leases
+pub(super) async fn claim<C: Connection>(
+    connection: &mut C,
+    claim: &Claim,
+    now: SystemTime,
+    lease_now: SystemTime,
+) -> Result<Claims, Error> {
+    if claim.shares.max_running.is_some() {
+        // Two that count at once would pass the bound together.
+        connection.take_lock(Lock::Claims).await?;
+    }
+    let job = match &claim.begin {
+        Some((lease, created)) => prefetched(connection, claim, lease, *created, now, lease_now).await?,
+        None => match next(connection, claim, u32::MAX, now, lease_now).await? {
+            Some(job) => Some(job),
+            None => prefetched_by_any(connection, now, lease_now).await?,
+        },
+    };
+    let Some(job) = job else { return Ok(Claims::default()) };
+    let begun = begin(connection, claim, &job, now, lease_now).await?;
+    let prefetched = match claim.prefetch {
+        Some(terms) => prefetch(connection, claim, terms, now, lease_now).await?,
+        None => None,
+    };
+    Ok(Claims { begun: Some(begun), prefetched })
+}
+
+/// The job whose turn it is among those that nobody has a lease on; none where it has more observations than that.
+async fn next<C: Connection>(
+    connection: &mut C,
+    claim: &Claim,
+    max_observations: u32,
+    now: SystemTime,
+    lease_now: SystemTime,
+) -> Result<Option<Standing>, Error> {
+    for tenant in fairness::turns(connection, &claim.shares, lease_now).await? {
+        let first = Statement::new(select_standing!(
+            "WHERE state = 'QUEUED' AND tenant = $1 AND (deadline IS NULL OR deadline > $2) \
+             AND (lease_expires IS NULL OR lease_expires <= $3) ORDER BY priority DESC, create_time, id LIMIT 1"
+        ))
+        .bind(&tenant)
+        .bind(micros(now))
+        .bind(micros(lease_now))
+        .then(C::SKIP_LOCKED);
+        if let Some(row) = connection.optional_row(first).await? {
+            let job = Standing::from_row(&row)?;
+            return Ok(Some(job).filter(|job| job.observation_count <= max_observations));
+        }
+    }
+    Ok(None)
+}
+
+/// The job that an earlier claim of this worker prefetched, if nobody else has leased it since.
+async fn prefetched<C: Connection>(
+    connection: &mut C,
+    claim: &Claim,
+    lease: &Lease,
+    created: SystemTime,
+    now: SystemTime,
+    lease_now: SystemTime,
+) -> Result<Option<Standing>, Error> {
+    // One whose lease has expired is not among those that are counted for the bound.
+    let expires_after = claim.shares.max_running.map_or(i64::MIN, |_| micros(lease_now));
+    let same = Statement::new(select_standing!(
+        "WHERE tenant = $1 AND job = $2 AND attempt = $3 AND create_time = $4 AND state = 'QUEUED' \
+         AND (deadline IS NULL OR deadline > $5) AND lease_worker = $6 AND lease_expires > $7 \
+         AND (SELECT pause_time FROM queue) IS NULL"
+    ))
+    .bind(&lease.name.tenant)
+    .bind(&lease.name.job)
+    .bind(lease.attempt.saturating_sub(1))
+    .bind(micros(created))
+    .bind(micros(now))
+    .bind(&claim.worker)
+    .bind(expires_after)
+    .then(C::FOR_UPDATE);
+    connection.optional_row(same).await?.as_ref().map(Standing::from_row).transpose()
+}
+
+/// A job that any worker has prefetched: it would wait for that worker, and this one is idle. There are as many as
+/// workers at most, and their tenants' turns have come.
+async fn prefetched_by_any<C: Connection>(
+    connection: &mut C,
+    now: SystemTime,
+    lease_now: SystemTime,
+) -> Result<Option<Standing>, Error> {
+    let first = Statement::new(select_standing!(
+        "WHERE state = 'QUEUED' AND lease_expires IS NOT NULL AND lease_expires > $1 \
+         AND (deadline IS NULL OR deadline > $2) AND (SELECT pause_time FROM queue) IS NULL \
+         ORDER BY priority DESC, create_time, id LIMIT 1"
+    ))
+    .bind(micros(lease_now))
+    .bind(micros(now))
+    .then(C::SKIP_LOCKED);
+    connection.optional_row(first).await?.as_ref().map(Standing::from_row).transpose()
+}
+
+/// Begins an attempt at a queued job.
+async fn begin<C: Connection>(
+    connection: &mut C,
+    claim: &Claim,
+    job: &Standing,
+    now: SystemTime,
+    lease_now: SystemTime,
+) -> Result<Claimed, Error> {
+    let (attempt, sequence) = (job.attempt + 1, job.last_sequence + 1);
+    let lease = Statement::new(returning_job!(
+        "UPDATE jobs SET state = 'RUNNING', attempt = $1, start_time = COALESCE(start_time, $2), lease_worker = $3, \
+         lease_expires = $4, progress = NULL, last_sequence = $5 WHERE id = $6"
+    ))
+    .bind(attempt)
+    .bind(micros(now))
+    .bind(&claim.worker)
+    .bind(micros(lease_now + claim.lease_for))
+    .bind(integer(sequence))
+    .bind(job.id);
+    let begin = Statement::new("INSERT INTO attempts (job_id, attempt, worker, start_time) VALUES ($1, $2, $3, $4)")
+        .bind(job.id)
+        .bind(attempt)
+        .bind(&claim.worker)
+        .bind(micros(now));
+    let event = EventBody::State { state: JobState::Running, failure: None };
+    let event = insert_event(job.id, sequence, attempt, &event, now)?;
+    let count = fairness::count::<C>(&claim.shares, &job.name.tenant);
+    let rows = connection.batch(vec![lease, begin, event, count]).await?;
+    connection.tell(Change::Events, &job.name).await?;
+    let changed = rows.first().ok_or_else(|| Error::Corrupt("a job that was just leased is not there".into()))?;
+    claimed(changed, 0)
+}
+
+/// Leases the next job without a word to anyone: it is not begun.
+async fn prefetch<C: Connection>(
+    connection: &mut C,
+    claim: &Claim,
+    terms: Prefetch,
+    now: SystemTime,
+    lease_now: SystemTime,
+) -> Result<Option<Claimed>, Error> {
+    let Some(job) = next(connection, claim, terms.max_observations, now, lease_now).await? else { return Ok(None) };
+    let lease = Statement::new(returning_job!("UPDATE jobs SET lease_worker = $1, lease_expires = $2 WHERE id = $3"))
+        .bind(&claim.worker)
+        .bind(micros(lease_now + terms.lease_for))
+        .bind(job.id);
+    claimed(&connection.row(lease).await?, 1).map(Some)
+}
+
+/// A job with its lease, from a row of all its columns. `ahead`: attempts that are to be begun before the lease's.
+fn claimed(row: &impl Row, ahead: u32) -> Result<Claimed, Error> {
+    let job = rows::job(row)?;
+    Ok(Claimed {
+        lease: Lease { name: job.name.clone(), attempt: job.attempt + ahead },
+        job,
+        trace_parent: row.optional_text("trace_parent")?,
+        queue_time: rows::time(row.integer("queue_time")?),
+    })
+}

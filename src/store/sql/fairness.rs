@@ -1,0 +1,94 @@
+//! Whose turn it is: tenants share the workers by start-time fair queueing (Goyal, Vin, Cheng: Start-time Fair
+//! Queueing, 1996).
+//!
+//! Each tenant has a virtual time, at which its latest job began. Its next one begins a step later, and the tenant
+//! whose next one begins first has its turn. A step is shorter the larger the tenant's weight. The virtual time of all
+//! is that at which the latest job of any began: a tenant that had nothing to do goes on from there, so that it saves
+//! nothing up. All of it is in the tables: it holds over all servers of a store, and after a restart.
+//!
+//! Servers that begin jobs of one tenant at the same moment do not wait for each other. A job then may go uncounted,
+//! and the tenant be served once more than its share.
+
+use std::collections::HashSet;
+use std::time::SystemTime;
+
+use super::rows::micros;
+use super::{Connection, Row, Statement};
+use crate::store::Error;
+use crate::store::record::TenantShares;
+
+/// Virtual time between two jobs of a tenant of weight 1: a multiple of small weights, so that shares are exact.
+const STEP: i64 = 1_000_000;
+
+fn step(shares: &TenantShares, tenant: &str) -> i64 {
+    STEP / i64::from(shares.weight(tenant))
+}
+
+/// Notes a tenant that has a job. By one transaction at a time: who admits jobs has the lock.
+pub(super) async fn register<C: Connection>(connection: &mut C, tenant: &str) -> Result<(), Error> {
+    let insert = "INSERT INTO tenants (tenant) SELECT $1 WHERE NOT EXISTS (SELECT 1 FROM tenants WHERE tenant = $1)";
+    connection.execute(Statement::new(insert).bind(tenant)).await
+}
+
+/// Tenants that have jobs waiting and may begin one, in the order of their turns; none while the queue is paused.
+///
+/// * `lease_now`: now, on the clock of leases
+pub(super) async fn turns<C: Connection>(
+    connection: &mut C,
+    shares: &TenantShares,
+    lease_now: SystemTime,
+) -> Result<Vec<String>, Error> {
+    // One step through the index for each tenant that waits, not for each job.
+    let select = Statement::new(
+        "WITH RECURSIVE waiting (tenant) AS ( \
+             SELECT (SELECT tenant FROM jobs WHERE state = 'QUEUED' ORDER BY tenant LIMIT 1) \
+             UNION ALL \
+             SELECT (SELECT jobs.tenant FROM jobs WHERE state = 'QUEUED' AND jobs.tenant > waiting.tenant \
+                     ORDER BY jobs.tenant LIMIT 1) \
+             FROM waiting WHERE waiting.tenant IS NOT NULL) \
+         SELECT waiting.tenant AS tenant, COALESCE(tenants.virtual_start, 0) AS virtual_start \
+         FROM waiting LEFT JOIN tenants ON tenants.tenant = waiting.tenant \
+         WHERE waiting.tenant IS NOT NULL AND (SELECT pause_time FROM queue) IS NULL",
+    );
+    let full = full(connection, shares, lease_now).await?;
+    let mut turns = Vec::new();
+    for row in connection.rows(select).await? {
+        let tenant = row.text("tenant")?;
+        if !full.contains(&tenant) {
+            turns.push((row.integer("virtual_start")?.saturating_add(step(shares, &tenant)), tenant));
+        }
+    }
+    turns.sort_unstable();
+    Ok(turns.into_iter().map(|(_, tenant)| tenant).collect())
+}
+
+/// Tenants with as many jobs running or prefetched as may run at once.
+async fn full<C: Connection>(
+    connection: &mut C,
+    shares: &TenantShares,
+    lease_now: SystemTime,
+) -> Result<HashSet<String>, Error> {
+    let Some(max_running) = shares.max_running else { return Ok(HashSet::new()) };
+    let select = Statement::new(
+        "SELECT tenant FROM ( \
+             SELECT tenant FROM jobs WHERE state = 'RUNNING' AND lease_expires IS NOT NULL \
+             UNION ALL SELECT tenant FROM jobs WHERE state = 'QUEUED' AND lease_expires > $1) AS leased \
+         GROUP BY tenant HAVING COUNT(*) >= $2",
+    );
+    let rows = connection.rows(select.bind(micros(lease_now)).bind(max_running)).await?;
+    rows.iter().map(|row| row.text("tenant")).collect()
+}
+
+/// Counts a job that a tenant begins, unless another transaction is counting one of it.
+pub(super) fn count<C: Connection>(shares: &TenantShares, tenant: &str) -> Statement {
+    Statement::new(
+        "UPDATE tenants SET virtual_start = CASE \
+             WHEN virtual_start + $1 > (SELECT MAX(virtual_start) FROM tenants) THEN virtual_start + $1 \
+             ELSE (SELECT MAX(virtual_start) FROM tenants) END \
+         WHERE tenant = (SELECT tenant FROM tenants WHERE tenant = $2",
+    )
+    .bind(step(shares, tenant))
+    .bind(tenant)
+    .then(C::SKIP_LOCKED)
+    .then(")")
+}
