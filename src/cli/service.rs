@@ -18,7 +18,7 @@ use crate::rpc::server::{self, Server};
 use crate::store::postgres::Postgres;
 use crate::store::sqlite::Sqlite;
 use crate::store::timed::Timed;
-use crate::store::{QueueBounds, Store};
+use crate::store::{QueueBounds, Store, TenantShares};
 
 /// How long calls may outlast the engine's drain: their streams end with it, so this is for the network only.
 const CALLS_BOUND: Duration = Duration::from_secs(5);
@@ -211,6 +211,10 @@ fn engine_options(config: &Config) -> engine::Options {
             max_tenant_jobs: bound_or_none(config.engine.tenant_queue_capacity),
             max_tenant_bytes: bound_or_none(config.engine.tenant_queue_bytes),
         },
+        shares: Arc::new(TenantShares {
+            weights: config.engine.tenant_weights.0.clone(),
+            max_running: Some(config.engine.tenant_max_running).filter(|&max| max > 0),
+        }),
         uploads: engine::UploadOptions {
             bounds: engine::UploadBounds {
                 max_bytes: config.upload.max_bytes,
@@ -264,7 +268,7 @@ mod tests {
     fn a_configuration_of_defaults_is_the_default_of_engine_and_server() {
         let config = Config::default();
         let of = |options: engine::Options| {
-            let queue = (options.queue, options.uploads);
+            let queue = (options.queue, options.shares, options.uploads);
             (options.workers, queue, options.lease, options.max_attempts, options.retention, options.backend)
         };
         assert_eq!(of(engine_options(&config)), of(engine::Options::default()));

@@ -7,6 +7,7 @@ mod exposure;
 mod file;
 mod retention;
 mod sections;
+mod weights;
 
 use std::path::{Path, PathBuf};
 
@@ -16,6 +17,7 @@ use crate::domain::Limits;
 use crate::store::postgres::DatabaseUrl;
 pub use retention::Retention;
 pub use sections::{Auth, Compute, Engine, Http, Log, Metrics, Otlp, Rates, Server, Store, Tls, Upload, Webhooks};
+pub use weights::TenantWeights;
 
 /// Everything that the server can be told.
 #[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]

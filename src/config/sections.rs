@@ -8,6 +8,7 @@ use axum::http::uri::Authority;
 use serde::de::IntoDeserializer;
 use serde::{Deserialize, Deserializer, Serialize, Serializer};
 
+use super::weights::TenantWeights;
 use super::{Error, Retention};
 use crate::domain::Backend;
 use crate::engine::WebhookSecrets;
@@ -279,6 +280,11 @@ pub struct Engine {
     pub tenant_queue_capacity: u64,
     /// Bytes of waiting inputs of one tenant at which its new jobs are refused; 0: the queue's own bound is enough.
     pub tenant_queue_bytes: u64,
+    /// Jobs of one tenant that run at once at most; 0: no bound.
+    pub tenant_max_running: u32,
+    /// Jobs that a tenant begins for each one of a tenant of weight 1, while both have some waiting; 1 for tenants that
+    /// are not named. Entries `TENANT=WEIGHT`, separated by commas.
+    pub tenant_weights: TenantWeights,
     /// Seconds without a heartbeat after which a job may be taken over.
     pub lease_seconds: u64,
     /// Seconds that running jobs get to finish once the server was told to stop; then they go back to the queue.
@@ -300,6 +306,8 @@ impl Default for Engine {
             // Without API keys there is one tenant, and nobody to keep room for.
             tenant_queue_capacity: 0,
             tenant_queue_bytes: 0,
+            tenant_max_running: 0,
+            tenant_weights: TenantWeights::default(),
             lease_seconds: Options::DEFAULT_LEASE.as_secs(),
             // Kubernetes kills 30 s after it asks; this leaves a third of it for the rest of the exit.
             drain_seconds: 20,

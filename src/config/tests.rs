@@ -150,6 +150,10 @@ fn errors_name_the_key_and_what_would_be_right() {
         (from_file("[log]\nfilter = \"scpsfm=loud\"\n"), &["log.filter", "`info`"]),
         (from_variable("SCPSFM_STORE__URL", "mysql://me:hunter2@host/db"), &["store.url", "postgres://USER"]),
         (from_variable("SCPSFM_ENGINE__WORKERS", "many"), &["engine.workers", "many", "environment"]),
+        (
+            from_variable("SCPSFM_ENGINE__TENANT_WEIGHTS", "acme=0"),
+            &["engine.tenant_weights", "TENANT=WEIGHT", "acme=0"],
+        ),
         (from_variable("SCPSFM_ENGINE_WORKERS", "4"), &["SCPSFM_ENGINE_WORKERS", "SCPSFM_ENGINE__WORKERS"]),
         (from_variable("SCPSFM_OTLP__ENDPOINT", "x:4317"), &["otlp.endpoint", "http://127.0.0.1:4317"]),
         (from_file("[rates]\ncalls_burst = 0\n"), &["rates.calls_burst", "from 1 on"]),

@@ -64,6 +64,7 @@ fn sample(section: &str, key: &str, schema: &Value) -> String {
         ("otlp", "endpoint") => "http://collector.monitoring:4317",
         ("http", "hosts") => "solver.example",
         ("http", "allowed_origins") => "https://app.example",
+        ("engine", "tenant_weights") => "acme=3, globex=2",
         ("compute", "prior") => "/models/my.prior",
         ("log", "filter") => "info,scpsfm::engine=debug",
         _ => match (schema["enum"][0].as_str(), schema["type"].as_str()) {

@@ -382,3 +382,47 @@ async fn a_withdrawn_key_ends_its_streams_both_ways_and_nobody_elses() {
     })
     .await;
 }
+
+/// When something was, to be compared.
+fn moment(time: Option<&prost_types::Timestamp>) -> Option<(i64, i32)> {
+    time.map(|time| (time.seconds, time.nanos))
+}
+
+#[tokio::test]
+async fn a_tenant_with_a_long_queue_hardly_delays_the_single_job_of_another() {
+    const MANY: usize = 300;
+    let (solver, hold) = held();
+    let mut engine = one_worker();
+    engine.queue.max_jobs = 2 * MANY as u64;
+    let server = TestServer::start_with(solver, two_tenants(), engine).await;
+    let (mut north, mut south) = (Tenant::of(&server, NORTH).await, Tenant::of(&server, SOUTH).await);
+    // Whatever priority it gives its own.
+    let urgent = proto::Job { priority: 9, ..Default::default() };
+    let request = proto::CreateJobRequest { job: Some(urgent), ..create_tracks() };
+    let request = proto::CreateJobRequest { parent: "tenants/north".into(), ..request };
+    let batch = proto::BatchCreateJobsRequest { parent: "tenants/north".into(), requests: vec![request; MANY] };
+    let created = north.jobs.batch_create_jobs(batch).await.expect("jobs").into_inner().jobs;
+    let get = |job: &proto::Job| proto::GetJobRequest { name: job.name.clone() };
+    soon(async {
+        while north.jobs.get_job(get(&created[0])).await.expect("a job").into_inner().state() != JobState::Running {
+            tokio::time::sleep(Duration::from_millis(5)).await;
+        }
+    })
+    .await;
+    let request = proto::CreateJobRequest { parent: "tenants/south".into(), ..create_tracks() };
+    let single = south.create(request).await.expect("a job");
+    hold.let_go();
+    let watch = proto::WatchJobRequest { name: single.name.clone(), after_sequence: 0 };
+    let watch = south.jobs.watch_job(watch).await.expect("a watch").into_inner();
+    let (events, _) = soon(all(watch)).await;
+    assert_eq!(events.last().and_then(state_of), Some(JobState::Succeeded));
+    let single = south.jobs.get_job(get(&single)).await.expect("a job").into_inner();
+    let (came, began) = (moment(single.create_time.as_ref()), moment(single.start_time.as_ref()));
+
+    let list = proto::ListJobsRequest { parent: "tenants/north".into(), page_size: 1000, ..Default::default() };
+    let jobs = north.jobs.list_jobs(list).await.expect("a page").into_inner().jobs;
+    assert_eq!(jobs.len(), MANY);
+    let begins = jobs.iter().filter_map(|job| moment(job.start_time.as_ref())).map(Some);
+    let before: Vec<_> = begins.filter(|&begin| begin > came && begin < began).collect();
+    assert!(before.len() <= 2, "{} of its jobs were begun while the other tenant's waited", before.len());
+}
