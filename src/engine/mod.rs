@@ -3,7 +3,6 @@
 //! Knows nothing of transport. Depends on `store`, `solver`, `telemetry` and `domain`; its channels never leave it.
 
 mod admin;
-mod clock;
 mod drain;
 mod error;
 mod execution;
@@ -28,11 +27,10 @@ use tokio::sync::{Notify, watch as channel};
 use tokio_util::sync::CancellationToken;
 
 pub use crate::store::{
-    EncodedResult, InputPage, InputQuery, JobPage, JobQuery, Load, NewUpload, Order, QueueBounds, QueueReport,
+    Clock, EncodedResult, InputPage, InputQuery, JobPage, JobQuery, Load, NewUpload, Order, QueueBounds, QueueReport,
     StoredInput, TakenId, TenantQueue, TenantShares, UploadBounds, UploadStatus,
 };
 pub use crate::telemetry::metrics::GivenUp;
-pub use clock::Clock;
 pub use drain::Drained;
 pub use error::Error;
 pub use submit::{Deadline, JobInput, NewJob};

@@ -60,6 +60,10 @@ pub struct NewJob {
     pub webhook_url: Option<String>,
 }
 
+/// Observations that are encoded on a thread that serves others: a fraction of a millisecond's work, less than a
+/// thread takes to wake up beside busy solvers.
+const FEW_OBSERVATIONS: usize = 2_000;
+
 impl NewJob {
     /// A job with nothing but what every job has.
     pub fn new(tenant: impl Into<String>, input: impl Into<JobInput>, settings: SolveSettings) -> Self {
@@ -104,7 +108,7 @@ impl NewJob {
     }
 
     /// What is stored; `uploaded` is the input that it names, where it names one. Encodes and, for a request id, hashes
-    /// the whole input: not for an async thread.
+    /// the whole input: not for an async thread where that is large.
     fn into_record(self, uploaded: Option<StoredInput>, now: SystemTime, backend: Backend) -> Result<NewRecord, Error> {
         // Bounded by the limits on inputs, which are far below what a u32 holds.
         let count = |number: usize| u32::try_from(number).unwrap_or(u32::MAX);
@@ -187,10 +191,14 @@ impl Inner {
         }
         let now = self.now();
         let backend = self.options.backend;
+        let mut observations = 0;
         let mut uploaded = Vec::new();
         for new in &news {
             uploaded.push(match &new.input {
-                JobInput::Inline(_) => None,
+                JobInput::Inline(input) => {
+                    observations += input.observation_count();
+                    None
+                }
                 JobInput::Uploaded(name) => Some(self.store.uploaded_input(name).await?),
             });
         }
@@ -198,7 +206,11 @@ impl Inner {
             let each = news.into_iter().zip(uploaded);
             each.map(|(new, uploaded)| new.into_record(uploaded, now, backend)).collect::<Result<Vec<_>, _>>()
         };
-        let records = finished(tokio::task::spawn_blocking(encode)).await?;
+        let records = if observations <= FEW_OBSERVATIONS {
+            encode()?
+        } else {
+            finished(tokio::task::spawn_blocking(encode)).await?
+        };
         // On its own task: a caller that goes away must not leave a stored job untold.
         finished(tokio::spawn(async move { self.store_jobs(records, now).await })).await
     }

@@ -3,6 +3,7 @@
 //! Only this module sees SQL, but for `formats`, which reads COLMAP's databases. Depends on `domain` and `telemetry`;
 //! the state machine's rules are the domain's, what is written in one transaction is decided here.
 
+mod clock;
 mod input_query;
 pub mod payload;
 pub mod postgres;
@@ -26,6 +27,7 @@ use crate::domain::job::{Job, JobEvent, JobName, JobState};
 use crate::domain::progress::Progress;
 use crate::domain::{InputName, Oversize};
 
+pub use clock::Clock;
 pub use input_query::{InputPage, InputQuery};
 pub use query::{JobPage, JobQuery, Order};
 pub use record::{

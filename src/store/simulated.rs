@@ -11,11 +11,12 @@ use futures_util::FutureExt;
 use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 use tokio::sync::{OwnedMutexGuard, broadcast};
-use tokio::time::sleep;
+use tokio::time::{Instant, sleep};
 
-use super::sql::{Change, Connection, Database, Moves, Operation, Row, Size, Statement};
+use super::clock::LeaseClock;
+use super::sql::{Change, Connection, Database, Moves, Operation, Row, Size, Statement, micros};
 use super::sqlite::{WriteConnection, WrittenRow};
-use super::{Error, Hint};
+use super::{Clock, Error, Hint};
 use crate::domain::job::JobName;
 
 /// Notifications that a server may be behind before it is told that some are lost.
@@ -59,8 +60,6 @@ pub(crate) struct Faults {
 pub(crate) struct Link {
     faults: Faults,
     rng: ChaCha8Rng,
-    /// What the server takes for the distance of the clocks.
-    known_clock_ahead: i32,
 }
 
 impl Link {
@@ -92,12 +91,27 @@ impl Cluster {
         }
     }
 
-    /// A server's connection. `SHARED`: whether there may be others.
-    pub(crate) fn connect<const SHARED: bool>(&self, seed: u64) -> Simulated<SHARED> {
-        let link = Link { faults: Faults::default(), rng: ChaCha8Rng::seed_from_u64(seed), known_clock_ahead: 0 };
+    /// A server's connection, at the time `now` of the database's clock. `SHARED`: whether there may be others.
+    pub(crate) fn connect<const SHARED: bool>(&self, seed: u64, now: SystemTime) -> Simulated<SHARED> {
+        let link = Link { faults: Faults::default(), rng: ChaCha8Rng::seed_from_u64(seed) };
+        let link = Arc::new(Mutex::new(link));
+        let origin = Instant::now();
+        let database_clock = Clock::new(move || now + origin.elapsed());
+        let wall_clock = {
+            let (database_clock, link) = (database_clock.clone(), link.clone());
+            Clock::new(move || {
+                let ahead = link.lock().unwrap_or_else(PoisonError::into_inner).faults.clock_ahead;
+                let distance = Duration::from_secs(ahead.unsigned_abs().into());
+                let time = database_clock.now();
+                if ahead < 0 { time - distance } else { time + distance }
+            })
+        };
         Simulated {
             cluster: self.clone(),
-            link: Arc::new(Mutex::new(link)),
+            link,
+            lease_clock: LeaseClock::new(wall_clock.clone()),
+            database_clock,
+            wall_clock,
             notifications: tokio::sync::Mutex::new(self.notifications.subscribe()),
         }
     }
@@ -115,6 +129,10 @@ impl Cluster {
 pub(crate) struct Simulated<const SHARED: bool> {
     cluster: Cluster,
     link: Arc<Mutex<Link>>,
+    database_clock: Clock,
+    /// The server's.
+    wall_clock: Clock,
+    lease_clock: LeaseClock,
     notifications: tokio::sync::Mutex<broadcast::Receiver<Hint>>,
 }
 
@@ -129,6 +147,11 @@ impl<const SHARED: bool> Simulated<SHARED> {
     /// The way to the database, for its faults to be set.
     pub(crate) fn link(&self) -> Arc<Mutex<Link>> {
         self.link.clone()
+    }
+
+    /// The wall clock of the server.
+    pub(crate) fn wall_clock(&self) -> Clock {
+        self.wall_clock.clone()
     }
 
     fn locked(&self) -> MutexGuard<'_, Link> {
@@ -192,18 +215,18 @@ impl<const SHARED: bool> Database for Simulated<SHARED> {
     }
 
     fn lease_clock(&self, now: SystemTime) -> SystemTime {
-        if !SHARED {
-            return now;
-        }
-        let ahead = self.locked().known_clock_ahead;
-        let distance = Duration::from_secs(ahead.unsigned_abs().into());
-        if ahead < 0 { now + distance } else { now - distance }
+        self.lease_clock.translate(now)
     }
 
     async fn set_lease_clock(&self) -> Result<(), Error> {
+        if !SHARED {
+            return Ok(());
+        }
+        let asked = Instant::now();
         self.pass(Way::There).await?;
-        let mut link = self.locked();
-        link.known_clock_ahead = link.faults.clock_ahead;
+        let theirs = micros(self.database_clock.now());
+        self.pass(Way::Back).await?;
+        self.lease_clock.follow(theirs, asked);
         Ok(())
     }
 
@@ -333,7 +356,7 @@ mod tests {
     use crate::store::contract::store_contract;
 
     async fn open() -> Option<Arc<Simulated<true>>> {
-        Some(Arc::new(Cluster::new(None).connect(0)))
+        Some(Arc::new(Cluster::new(None).connect(0, SystemTime::UNIX_EPOCH)))
     }
 
     store_contract!(open);

@@ -4,7 +4,6 @@
 //! hold a job one is refused. Notifications carry the names of jobs and are hints: what they say is read from the
 //! tables.
 
-mod clock;
 mod listener;
 #[cfg(test)]
 mod locks_tests;
@@ -18,12 +17,12 @@ use std::time::{Duration, SystemTime};
 use sqlx::pool::PoolConnection;
 use sqlx::postgres::{PgConnectOptions, PgConnection, PgPool, PgPoolOptions, PgRow};
 use tokio::sync::Mutex;
-use tokio::time::timeout;
+use tokio::time::{Instant, timeout};
 
-use super::sql::{self, Change, Connection, Database, Lock, Moves, Operation, Size, Statement};
-use super::{Error, Hint};
+use super::clock::LeaseClock;
+use super::sql::{self, Change, Connection, Database, Lock, Moves, Operation, Row, Size, Statement};
+use super::{Clock, Error, Hint};
 use crate::domain::job::JobName;
-use clock::Clock;
 use listener::Listener;
 pub use url::{DatabaseUrl, UrlError};
 
@@ -66,7 +65,7 @@ const CLAIMS_LOCK: i64 = ADMISSION_LOCK + 1;
 pub struct Postgres {
     pool: PgPool,
     payloads: PgPool,
-    clock: Clock,
+    clock: LeaseClock,
     listener: Mutex<Listener>,
     /// Hears nothing, for tests of what polls alone achieve.
     #[cfg(test)]
@@ -88,16 +87,16 @@ impl Postgres {
         };
         let payloads = pool_of(PAYLOAD_CONNECTIONS).connect_lazy_with(options.clone());
         schema::update(&options).await?;
-        let clock = Clock::default();
-        clock.set(&mut *pool.acquire().await?).await?;
-        Ok(Self {
+        let store = Self {
             pool,
             payloads,
-            clock,
+            clock: LeaseClock::new(Clock::default()),
             listener: Mutex::new(Listener::new(options)),
             #[cfg(test)]
             deaf: false,
-        })
+        };
+        store.set_lease_clock().await?;
+        Ok(store)
     }
 
     fn pool(&self, size: Size) -> &PgPool {
@@ -194,13 +193,18 @@ impl Database for Postgres {
     }
 
     async fn set_lease_clock(&self) -> Result<(), Error> {
-        self.clock.set(&mut *self.pool.acquire().await?).await
+        let select = Statement::new("SELECT CAST(EXTRACT(EPOCH FROM clock_timestamp()) * 1000000 AS BIGINT) AS micros");
+        let mut connection = self.pool.acquire().await?;
+        let asked = Instant::now();
+        let theirs = connection.row(select).await?.integer("micros")?;
+        self.clock.follow(theirs, asked);
+        Ok(())
     }
 
     async fn bytes(&self) -> Result<u64, Error> {
         let select = Statement::new("SELECT pg_database_size(current_database()) AS bytes");
         let row = self.reader(Size::Small).await?.row(select).await?;
-        Ok(u64::try_from(sql::Row::integer(&row, "bytes")?).unwrap_or(0))
+        Ok(u64::try_from(row.integer("bytes")?).unwrap_or(0))
     }
 
     async fn heard(&self) -> Hint {

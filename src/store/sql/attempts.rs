@@ -122,6 +122,12 @@ pub(super) async fn take_back<C: Connection>(
     let select = Statement::new(select_standing!("WHERE state = 'RUNNING' AND lease_expires <= $1 ORDER BY id"))
         .bind(expired_at.map_or(i64::MAX, micros))
         .then(C::SKIP_LOCKED);
+    if expired_at.is_none() {
+        // Nor is anything prefetched that a process of before had leased.
+        let free = "UPDATE jobs SET lease_worker = NULL, lease_expires = NULL \
+                    WHERE state = 'QUEUED' AND lease_expires IS NOT NULL";
+        connection.execute(Statement::new(free)).await?;
+    }
     let mut changed = Vec::new();
     for row in connection.rows(select).await? {
         let job = Standing::from_row(&row)?;

@@ -24,6 +24,7 @@ use sqlx::migrate::{Migration, MigrationType, Migrator};
 
 use super::{Error, Hint};
 use crate::domain::job::JobName;
+pub(super) use rows::{micros, time};
 pub(super) use statement::{Row, Statement, Value, run};
 
 /// A connection to a database, within a transaction or not: unless it says otherwise, one that has the database to
@@ -137,10 +138,8 @@ pub(super) trait Database: Send + Sync + 'static {
     fn bound(&self, size: Size) -> Option<Duration>;
 
     /// The time on the clock that leases run on, where the caller's shows `now`: one clock for every process that holds
-    /// or takes back leases.
-    fn lease_clock(&self, now: SystemTime) -> SystemTime {
-        now
-    }
+    /// or takes back leases, and a steady one.
+    fn lease_clock(&self, now: SystemTime) -> SystemTime;
 
     /// Compares the caller's clock with that of the leases; called again and again, as clocks drift.
     fn set_lease_clock(&self) -> impl Future<Output = Result<(), Error>> + Send {

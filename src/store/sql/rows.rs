@@ -38,7 +38,7 @@ macro_rules! returning_job {
 pub(super) use returning_job;
 
 /// Microseconds since the epoch; times outside of what an `i64` holds are clamped.
-pub(super) fn micros(time: SystemTime) -> i64 {
+pub(in crate::store) fn micros(time: SystemTime) -> i64 {
     let after = |duration: Duration| i64::try_from(duration.as_micros()).unwrap_or(i64::MAX);
     match time.duration_since(SystemTime::UNIX_EPOCH) {
         Ok(since) => after(since),
@@ -47,7 +47,7 @@ pub(super) fn micros(time: SystemTime) -> i64 {
 }
 
 /// The time of [`micros`].
-pub(super) fn time(micros: i64) -> SystemTime {
+pub(in crate::store) fn time(micros: i64) -> SystemTime {
     let distance = Duration::from_micros(micros.unsigned_abs());
     let there = if micros < 0 {
         SystemTime::UNIX_EPOCH.checked_sub(distance)

@@ -16,7 +16,7 @@ mod writer;
 
 use std::fs::{File, TryLockError};
 use std::path::{Path, PathBuf};
-use std::time::Duration;
+use std::time::{Duration, SystemTime};
 
 use sqlx::pool::PoolConnection;
 use sqlx::sqlite::{
@@ -24,8 +24,9 @@ use sqlx::sqlite::{
     SqliteRow,
 };
 
+use super::clock::LeaseClock;
 use super::sql::{self, Connection, Database, Moves, Operation, Size, Statement, Step};
-use super::{Error, Hint};
+use super::{Clock, Error, Hint};
 pub(super) use connection::WriteConnection;
 #[cfg(test)]
 pub(super) use connection::WrittenRow;
@@ -72,6 +73,7 @@ const OWN_TABLES: &str = "SELECT COUNT(*) FROM sqlite_schema WHERE name IN ('_sq
 pub struct Sqlite {
     writer: Writer,
     has_room: Room,
+    clock: LeaseClock,
     readers: SqlitePool,
     /// The database and its write-ahead log.
     files: [PathBuf; 2],
@@ -108,7 +110,8 @@ impl Sqlite {
         let files = [database.clone(), log_of(&database)];
         let writer = Writer::start(connection, database, reserve, group_time)?;
         let readers = readers().connect_with(options.pragma("query_only", "1")).await?;
-        Ok(Self { writer, has_room, readers, files, _lock: lock })
+        let clock = LeaseClock::new(Clock::default());
+        Ok(Self { writer, has_room, clock, readers, files, _lock: lock })
     }
 
     /// Runs statements as they are on the writer's connection, for tests that need the database to misbehave.
@@ -264,6 +267,10 @@ impl Database for Sqlite {
 
     fn bound(&self, _size: Size) -> Option<Duration> {
         None
+    }
+
+    fn lease_clock(&self, now: SystemTime) -> SystemTime {
+        self.clock.translate(now)
     }
 
     /// The file and its log.

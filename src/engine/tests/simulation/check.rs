@@ -4,7 +4,7 @@ use tokio::runtime::Builder;
 
 use super::client::{Clients, Known, request};
 use super::server::Behavior;
-use super::{MAX_ATTEMPTS, MAX_JOBS};
+use super::{MAX_ATTEMPTS, MAX_JOBS, beginning};
 use crate::domain::job::{EventBody, Job, JobEvent, JobName, JobState};
 use crate::store::simulated::Cluster;
 use crate::store::{ATTEMPTS_EXHAUSTED, Error, Store};
@@ -31,7 +31,7 @@ pub(super) fn open_jobs(cluster: &Cluster) -> i64 {
 
 /// What is stored once everything has come to rest.
 pub(super) fn at_the_end(cluster: &Cluster, clients: &Clients) -> Result<(), String> {
-    let store = cluster.connect::<true>(0);
+    let store = cluster.connect::<true>(0, beginning());
     let runtime = Builder::new_current_thread().enable_time().start_paused(true).build().expect("a runtime");
     runtime.block_on(async {
         let (jobs, sent) = clients.known();

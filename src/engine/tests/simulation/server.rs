@@ -2,19 +2,19 @@
 
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::{Arc, Mutex, PoisonError};
-use std::time::{Duration, SystemTime};
+use std::time::Duration;
 
 use tokio::runtime::{Builder, Runtime};
 use tokio::sync::mpsc;
 use tokio::task::JoinHandle;
-use tokio::time::{Instant, sleep};
+use tokio::time::sleep;
 
 use super::check::result_of;
 use super::{MAX_ATTEMPTS, MAX_JOBS, Plan};
 use crate::engine::drain::Threads;
 use crate::engine::tests::{input, progress, solution};
 use crate::engine::worker::{Assigned, Worker};
-use crate::engine::{Clock, Drained, Engine, Error, Options};
+use crate::engine::{Drained, Engine, Error, Options};
 use crate::store::simulated::{Faults, Link, Simulated};
 
 /// What becomes of a job, by its settings' seed.
@@ -57,30 +57,20 @@ impl Server {
     /// Starts a server, which is up some steps later, or gone.
     pub(super) fn start<const SHARED: bool>(
         number: u64,
-        store: Simulated<SHARED>,
+        connect: impl FnOnce() -> Simulated<SHARED>,
         plan: Plan,
-        now: SystemTime,
     ) -> Self {
         let runtime = Builder::new_current_thread().enable_time().start_paused(true).build().expect("a runtime");
-        let link = store.link();
         let dead = Arc::new(AtomicBool::new(false));
         let entered = runtime.enter();
-        let origin = Instant::now();
-        let clock = {
-            let link = link.clone();
-            Clock::new(move || {
-                let ahead = link.lock().unwrap_or_else(PoisonError::into_inner).faults().clock_ahead;
-                let time = now + origin.elapsed();
-                let distance = Duration::from_secs(ahead.unsigned_abs().into());
-                if ahead < 0 { time - distance } else { time + distance }
-            })
-        };
+        let store = connect();
+        let link = store.link();
         let mut options = Options {
             workers: plan.workers,
             lease: plan.lease,
             max_attempts: MAX_ATTEMPTS,
             worker_name: format!("server-{number}"),
-            clock,
+            clock: store.wall_clock(),
             ..Options::default()
         };
         options.queue.max_jobs = MAX_JOBS;
