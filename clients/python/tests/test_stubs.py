@@ -5,6 +5,7 @@ from __future__ import annotations
 import subprocess
 import sys
 from pathlib import Path
+from types import ModuleType
 
 import pytest
 from google.protobuf import descriptor_pb2
@@ -95,6 +96,13 @@ def test_every_call_has_its_stub(service: str) -> None:
     declared = {method.name for method in messages.DESCRIPTOR.services_by_name[service].methods}
     servicer = getattr(grpc_module, f"{service}Servicer")
     assert declared == {name for name in vars(servicer) if not name.startswith("_")}
+
+
+@pytest.mark.parametrize("module", MODULES.values(), ids=MODULES)
+def test_stubs_ask_for_no_newer_protobuf_than_the_package(module: ModuleType) -> None:
+    assert module.__file__ is not None
+    # Code of protoc from 26 on refuses every runtime that is older than itself.
+    assert "ValidateProtobufRuntimeVersion" not in Path(module.__file__).read_text(encoding="utf-8")
 
 
 def test_nothing_global_is_named_as_the_proto_packages_are() -> None:

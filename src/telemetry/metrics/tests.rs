@@ -124,7 +124,7 @@ fn what_is_known_beforehand_is_zero_before_the_first_job() {
     ] {
         assert_eq!(value(&page, series), Some(0.0), "{series}");
     }
-    for never in ["state=\"QUEUED\"", "state=\"RUNNING\""] {
+    for never in ["scpsfm_jobs_total{state=\"QUEUED\"", "scpsfm_jobs_total{state=\"RUNNING\""] {
         assert!(!page.contains(never), "{never} is not terminal");
     }
 }
