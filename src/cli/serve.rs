@@ -278,15 +278,15 @@ pub async fn run(args: Args) -> Result<Exit, Failure> {
         bound_seconds = config.engine.drain_seconds,
         "draining; a second signal gives running jobs back now"
     );
-    let hurry = CancellationToken::new();
+    let interrupt = CancellationToken::new();
     let impatience = async {
         signals.again().await;
         tracing::info!("running jobs go back to the queue; a third signal ends at once");
-        hurry.cancel();
+        interrupt.cancel();
         signals.again().await;
     };
     let drained = tokio::select! {
-        drained = service.stop(hurry.cancelled()) => drained?,
+        drained = service.stop(interrupt.cancelled()) => drained?,
         () = impatience => {
             return Err(Failure::interrupted_with("ended before the drain did: jobs that still ran begin again at the next start"));
         }
@@ -313,7 +313,7 @@ fn follow_store(ready: &telemetry::Readiness, mut store: tokio::sync::watch::Rec
     tokio::spawn(async move {
         loop {
             let state = *store.borrow_and_update();
-            ready.set_store(state == StoreState::Away, state == StoreState::Full);
+            ready.set_store(state == StoreState::Unavailable, state == StoreState::Full);
             if store.changed().await.is_err() {
                 return;
             }

@@ -15,9 +15,9 @@ use crate::http;
 use crate::rpc::convert::result::encode as encode_result;
 use crate::rpc::keys::Sources;
 use crate::rpc::server::{self, Server};
+use crate::store::instrumented::InstrumentedStore;
 use crate::store::postgres::Postgres;
 use crate::store::sqlite::Sqlite;
-use crate::store::timed::Timed;
 use crate::store::{QueueBounds, Store, TenantShares};
 
 /// How long calls may outlast the engine's drain: their streams end with it, so this is for the network only.
@@ -100,7 +100,7 @@ impl Service {
 
     /// Jobs that wait; `None` where the store does not say.
     pub async fn queued_jobs(&self) -> Option<u64> {
-        self.engine.load().await.ok().map(|load| load.queued)
+        self.engine.queue_stats().await.ok().map(|stats| stats.queued)
     }
 
     /// API keys at the start; `None`: callers need none.
@@ -127,17 +127,17 @@ impl Service {
     }
 
     /// Drains: health says NOT_SERVING, running jobs get their time and then go back to the queue, calls end, the store
-    /// is closed. Once `hurry` is over, so is the jobs' time.
+    /// is closed. Once `interrupt` is over, so is the jobs' time.
     ///
     /// # Errors
     /// Why the server had failed before.
-    pub async fn stop(self, hurry: impl Future<Output = ()>) -> Result<engine::Drained, Failure> {
+    pub async fn stop(self, interrupt: impl Future<Output = ()>) -> Result<engine::Drained, Failure> {
         self.server.set_draining().await;
         let mut drain = pin!(self.engine.drain(self.drain_bound));
         let drained = tokio::select! {
             drained = &mut drain => drained,
-            () = hurry => {
-                self.engine.hurry();
+            () = interrupt => {
+                self.engine.interrupt_running();
                 drain.await
             }
         };
@@ -189,11 +189,11 @@ async fn close(store: &dyn Store) {
 async fn open_store(config: &config::Store) -> Result<Arc<dyn Store>, Failure> {
     if let Some(url) = &config.url {
         let failed = |error| Failure::internal(format_args!("cannot open the store {url}: {error}"));
-        return Ok(Arc::new(Timed(Postgres::open(url).await.map_err(failed)?)));
+        return Ok(Arc::new(InstrumentedStore(Postgres::open(url).await.map_err(failed)?)));
     }
     let directory = config.data_dir.display();
     let failed = |error| Failure::internal(format_args!("cannot open the data directory {directory}: {error}"));
-    Ok(Arc::new(Timed(Sqlite::open(&config.data_dir).await.map_err(failed)?)))
+    Ok(Arc::new(InstrumentedStore(Sqlite::open(&config.data_dir).await.map_err(failed)?)))
 }
 
 /// A bound that 0 lifts.

@@ -83,7 +83,7 @@ impl Inner {
         let reply = retried?;
         if reply.queued_now {
             tracing::info!(job = %name, "retried");
-            self.hub.wake(name);
+            self.notifier.wake(name);
             self.work_waits();
             self.queue_changed();
         }

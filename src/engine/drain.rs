@@ -29,8 +29,8 @@ pub struct Drained {
 pub(super) struct WorkerPool {
     slots: Vec<JoinHandle<()>>,
     sweeper: Option<JoinHandle<()>>,
-    /// Heeds what other processes tell, where there are any.
-    hints: Option<JoinHandle<()>>,
+    /// Handles the notifications of other processes, where there are any.
+    notifications: Option<JoinHandle<()>>,
     /// Delivers webhooks, where they are on.
     webhooks: Option<JoinHandle<()>>,
     threads: Vec<thread::JoinHandle<()>>,
@@ -68,7 +68,7 @@ impl Inner {
         pool.slots = workers.into_iter().map(|worker| tokio::spawn(slot::run(self.clone(), worker))).collect();
         pool.sweeper = Some(tokio::spawn(slot::sweep(self.clone())));
         if self.store.is_shared() {
-            pool.hints = Some(tokio::spawn(super::hints::run(self.clone())));
+            pool.notifications = Some(tokio::spawn(super::notifications::run(self.clone())));
         }
         if let Some(options) = &self.options.webhooks {
             pool.webhooks = Some(webhooks::start(self, options).map_err(Error::Internal)?);
@@ -77,13 +77,13 @@ impl Inner {
         Ok(())
     }
 
-    pub(super) fn crew_finished_one(&self) {
+    pub(super) fn attempt_finished(&self) {
         if self.phase() != Phase::Open {
             locked(&self.pool).drained.finished += 1;
         }
     }
 
-    pub(super) fn crew_gave_one_back(&self) {
+    pub(super) fn attempt_given_back(&self) {
         if self.phase() != Phase::Open {
             locked(&self.pool).drained.given_back += 1;
         }
@@ -103,13 +103,13 @@ impl Inner {
         let (mut slots, others, threads, threads_ended) = {
             let mut pool = locked(&self.pool);
             let slots = std::mem::take(&mut pool.slots);
-            let others = [pool.sweeper.take(), pool.hints.take(), pool.webhooks.take()];
+            let others = [pool.sweeper.take(), pool.notifications.take(), pool.webhooks.take()];
             (slots, others, std::mem::take(&mut pool.threads), pool.threads_ended.take())
         };
         let in_time = timeout(bound, all_ended(&mut slots));
-        if !matches!(self.hurried.run_until_cancelled(in_time).await, Some(Ok(()))) {
+        if !matches!(self.interrupted.run_until_cancelled(in_time).await, Some(Ok(()))) {
             // Before the look: whoever is listed after it finds this.
-            self.hurried.cancel();
+            self.interrupted.cancel();
             for stop in locked(&self.running).values() {
                 stop.stop(StopReason::Interrupted);
             }

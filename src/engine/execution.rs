@@ -49,11 +49,11 @@ async fn in_time<T>(until: Instant, writing: impl Future<Output = Result<T, stor
 
 /// The input of a job, with the cancel that may have come before the job was listed as running.
 async fn read(store: Arc<dyn Store>, name: JobName, stop: StopToken) -> Result<Vec<u8>, store::Error> {
-    let work = store.work(&name).await?;
-    if work.cancel_requested {
+    let payload = store.job_payload(&name).await?;
+    if payload.cancel_requested {
         stop.stop(StopReason::Cancelled);
     }
-    Ok(work.input)
+    Ok(payload.input)
 }
 
 /// An attempt under way.
@@ -109,7 +109,7 @@ impl Running {
             Entry::Occupied(_) => stop.stop(StopReason::Interrupted),
         }
         // Claimed while a drain told those that were listed to stop.
-        if inner.hurried.is_cancelled() {
+        if inner.interrupted.is_cancelled() {
             stop.stop(StopReason::Interrupted);
         }
         Self { inner, lease: lease.clone(), stop: stop.clone() }
@@ -172,7 +172,7 @@ impl JobExecution {
 
     fn has_begun(&mut self, begun: Started, now: SystemTime) {
         self.leased_until = begun.at + self.inner.options.lease;
-        self.inner.hub.wake(&self.job.name);
+        self.inner.notifier.wake(&self.job.name);
         observe::waited(&self.job.name, self.trace_parent.as_deref(), self.queue_time, now);
         begun.span.in_scope(|| tracing::info!("attempt begins"));
         self.span = begun.span;
@@ -186,9 +186,9 @@ impl JobExecution {
                 Ok(input) => input,
                 Err(verdict) => return Err(Finished { execution: self, verdict, latest: None }),
             };
-            let subscription = self.inner.hub.subscribe(&self.job.name);
+            let subscription = self.inner.notifier.subscribe(&self.job.name);
             // Weights of an attempt before this one are nobody's any more.
-            subscription.topic().weights.send_replace(None);
+            subscription.channel().weights.send_replace(None);
             let assignment = Assignment {
                 name: self.job.name.clone(),
                 number: self.lease.attempt,
@@ -287,7 +287,7 @@ impl JobExecution {
         match in_time(self.leased_until, written).await {
             Ok(_) => {
                 self.stored = Some(progress);
-                self.inner.hub.wake(&self.job.name);
+                self.inner.notifier.wake(&self.job.name);
             }
             Err(error) => self.store_failed(&error),
         }
@@ -391,13 +391,13 @@ impl JobExecution {
                     "job ended"
                 );
                 self.inner.ended(&job);
-                self.inner.crew_finished_one();
+                self.inner.attempt_finished();
             }
             (Some(_), None) => {
                 tracing::info!("job given back to the queue");
                 observe::attempt_lost(AttemptLost::GivenBack);
-                self.inner.crew_gave_one_back();
-                self.inner.hub.wake(&self.job.name);
+                self.inner.attempt_given_back();
+                self.inner.notifier.wake(&self.job.name);
                 self.inner.queue_changed();
             }
             (None, _) => {

@@ -6,8 +6,8 @@ mod admin;
 mod drain;
 mod error;
 mod execution;
-mod hints;
-mod hub;
+mod notifications;
+mod notifier;
 mod observe;
 mod slot;
 mod submit;
@@ -27,8 +27,8 @@ use tokio::sync::{Notify, watch as channel};
 use tokio_util::sync::CancellationToken;
 
 pub use crate::store::{
-    Clock, EncodedResult, InputPage, InputQuery, JobPage, JobQuery, Load, NewUpload, Order, QueueBounds, QueueReport,
-    StoredInput, TakenId, TenantQueue, TenantShares, UploadBounds, UploadStatus,
+    Clock, EncodedResult, InputPage, InputQuery, JobPage, JobQuery, NewUpload, Order, QueueBounds, QueueReport,
+    QueueStats, StoredInput, TakenId, TenantQueue, TenantShares, UploadBounds, UploadStatus,
 };
 pub use crate::telemetry::metrics::GivenUp;
 pub use drain::Drained;
@@ -168,11 +168,11 @@ pub struct Engine {
 /// What can be done with the store.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum StoreState {
-    Sound,
+    Healthy,
     /// It can be read, and what was begun ends; there is no room to begin anything.
     Full,
-    /// It is out of reach: the server can neither take on nor tell anything.
-    Away,
+    /// It is out of reach: the server can neither take on nor report anything.
+    Unavailable,
 }
 
 /// Whether new work is taken on.
@@ -188,7 +188,7 @@ enum Phase {
 struct Inner {
     options: Options,
     store: Arc<dyn Store>,
-    hub: Arc<hub::Hub>,
+    notifier: Arc<notifier::Notifier>,
     /// Attempts that run in this process or are prefetched, for a cancel to reach them at once.
     running: Mutex<HashMap<Lease, StopToken>>,
     /// Counts the reasons to look for a job to claim; slots wait for a change.
@@ -198,8 +198,9 @@ struct Inner {
     /// Wakes the task that delivers webhooks.
     webhook_due: Notify,
     phase: channel::Sender<Phase>,
-    /// Cancelled once what runs is to go back to the queue: at the end of a drain's bound, or before by a hurry.
-    hurried: CancellationToken,
+    /// Cancelled once what runs is to go back to the queue: at the end of a drain's bound, or before by
+    /// [`Engine::interrupt_running`].
+    interrupted: CancellationToken,
     /// Cancelled once this server was asked to drain, which is for whoever runs the engine to do.
     drain_asked: CancellationToken,
     /// What the last sweep found.
@@ -230,21 +231,21 @@ impl Engine {
         let recovered = store.recover(options.clock.now(), options.max_attempts).await?;
         let inner = Arc::new(Inner {
             store,
-            hub: Arc::default(),
+            notifier: Arc::default(),
             running: Mutex::default(),
             work: channel::Sender::new(0),
             queue_changed: Notify::new(),
             webhook_due: Notify::new(),
             phase: channel::Sender::new(Phase::Open),
-            hurried: CancellationToken::new(),
+            interrupted: CancellationToken::new(),
             drain_asked: CancellationToken::new(),
-            store_state: channel::Sender::new(StoreState::Sound),
+            store_state: channel::Sender::new(StoreState::Healthy),
             pool: Mutex::default(),
             recovered_jobs: recovered.len(),
             options,
         });
         observe::engine_size(inner.options.queue.max_jobs, inner.options.workers);
-        observe::store_state(StoreState::Sound);
+        observe::store_state(StoreState::Healthy);
         inner.taken_back(&recovered);
         inner.hire(threads)?;
         inner.queue_changed();
@@ -364,8 +365,8 @@ impl Engine {
     ///
     /// # Errors
     /// [`Error::Internal`].
-    pub async fn load(&self) -> Result<Load, Error> {
-        Ok(self.inner.store.load().await?)
+    pub async fn queue_stats(&self) -> Result<QueueStats, Error> {
+        Ok(self.inner.store.queue_stats().await?)
     }
 
     /// What can be done with the store, as of a look a second.
@@ -379,8 +380,8 @@ impl Engine {
     }
 
     /// Ends the wait of a drain, also of one that is still to come: what runs goes back to the queue now.
-    pub fn hurry(&self) {
-        self.inner.hurried.cancel();
+    pub fn interrupt_running(&self) {
+        self.inner.interrupted.cancel();
     }
 
     /// Stops claiming, lets what runs finish within `bound`, gives the rest back to the queue, ends the workers and
@@ -433,7 +434,7 @@ impl Inner {
     /// Tells everyone that a job ended; called once a job, by whoever committed its end.
     fn ended(&self, job: &Job) {
         observe::job_ended(job);
-        self.hub.wake(&job.name);
+        self.notifier.wake(&job.name);
         self.queue_changed();
         if job.webhook.is_some() {
             self.webhook_due.notify_one();
@@ -452,7 +453,7 @@ impl Inner {
             if job.state.is_terminal() {
                 self.ended(job);
             } else {
-                self.hub.wake(&job.name);
+                self.notifier.wake(&job.name);
             }
         }
         if !jobs.is_empty() {

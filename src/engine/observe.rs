@@ -22,6 +22,6 @@ pub(super) fn store_stats(stats: StoreStats, now: SystemTime) {
 }
 
 pub(super) fn store_state(state: StoreState) {
-    store_reachable(state != StoreState::Away);
+    store_reachable(state != StoreState::Unavailable);
     store_full(state == StoreState::Full);
 }

@@ -144,7 +144,7 @@ pub(super) async fn sweep(inner: Arc<Inner>) {
             () = due(&inner, counted) => {}
             _ = ticks.tick() => {
                 inner.sweep().await;
-                if *inner.store_state.borrow() == StoreState::Away {
+                if *inner.store_state.borrow() == StoreState::Unavailable {
                     // Each further question would take its time to come to nothing, and the next look is due.
                     continue;
                 }
@@ -159,11 +159,11 @@ pub(super) async fn sweep(inner: Arc<Inner>) {
             }
         }
         counted = Instant::now();
-        match inner.store.load().await {
-            Ok(load) => {
-                observe::queue_depth(load.queued);
-                if std::mem::replace(&mut paused, load.paused) != load.paused {
-                    pause_changed(load.paused);
+        match inner.store.queue_stats().await {
+            Ok(stats) => {
+                observe::queue_depth(stats.queued);
+                if std::mem::replace(&mut paused, stats.paused) != stats.paused {
+                    pause_changed(stats.paused);
                 }
             }
             Err(error) => tracing::warn!(%error, "cannot count the queue"),
@@ -246,7 +246,7 @@ impl Inner {
     /// Notes what became of the store, for those who ask whether this server is of any use.
     fn store_is(&self, state: StoreState) {
         let mut before = state;
-        // Those who follow it hear of changes alone: each would tell its own followers.
+        // Subscribers get changes alone: each passes them on to subscribers of its own.
         let changed = self.store_state.send_if_modified(|known| {
             before = std::mem::replace(known, state);
             before != state
@@ -255,10 +255,10 @@ impl Inner {
             return;
         }
         observe::store_state(state);
-        // Of a full disk the store itself tells.
-        if state == StoreState::Away {
+        // Of a full disk the store itself logs.
+        if state == StoreState::Unavailable {
             tracing::error!("the store is out of reach, this server is not ready");
-        } else if before == StoreState::Away {
+        } else if before == StoreState::Unavailable {
             tracing::info!("the store is back, this server is ready again");
         }
     }
@@ -266,8 +266,8 @@ impl Inner {
     pub(super) async fn sweep(&self) {
         let swept = self.store.sweep(self.now(), self.options.max_attempts).await;
         self.store_is(match &swept {
-            Err(store::Error::Unavailable(_)) => StoreState::Away,
-            _ if self.store.has_room() => StoreState::Sound,
+            Err(store::Error::Unavailable(_)) => StoreState::Unavailable,
+            _ if self.store.has_room() => StoreState::Healthy,
             _ => StoreState::Full,
         });
         match swept {

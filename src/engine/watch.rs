@@ -7,12 +7,13 @@ use std::time::Duration;
 use futures_util::stream::{self, Stream};
 use tokio::sync::watch as channel;
 
-use super::hub::Subscription;
+use super::notifier::Subscription;
 use super::{Error, Inner, Phase};
 use crate::domain::Violation;
 use crate::domain::job::{EventBody, JobEvent, JobName};
 
-/// How often a watcher of a shared store looks unasked: the job may run in another process, whose hints may be lost.
+/// How often a watcher of a shared store looks unasked: the job may run in another process, whose notifications may
+/// be lost.
 const WATCH_POLL: Duration = Duration::from_secs(1);
 
 /// Events read from the store at once: a job has some dozens; a reader of thousands holds no more than this.
@@ -33,7 +34,7 @@ pub struct Watch {
     ahead: VecDeque<JobEvent>,
     /// Sequence number of the last event that was read.
     after: u64,
-    /// Nothing was in the store beyond `after` when this version of the topic was seen.
+    /// Nothing was in the store beyond `after` when this version of the channel was seen.
     caught_up: bool,
     ended: bool,
     /// After the receivers: keeps their senders alive.
@@ -49,9 +50,9 @@ impl std::fmt::Debug for Watch {
 impl Watch {
     pub(super) async fn open(inner: Arc<Inner>, name: JobName, after: u64) -> Result<Self, Error> {
         // First listen, then look: what is committed in between is seen either way.
-        let subscription = inner.hub.subscribe(&name);
-        let version = subscription.topic().version.subscribe();
-        let mut weights = subscription.topic().weights.subscribe();
+        let subscription = inner.notifier.subscribe(&name);
+        let version = subscription.channel().version.subscribe();
+        let mut weights = subscription.channel().weights.subscribe();
         if weights.borrow().is_some() {
             weights.mark_changed();
         }

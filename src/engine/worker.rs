@@ -11,7 +11,7 @@ use tokio::sync::{mpsc, oneshot, watch};
 use tokio::time::Instant;
 use tracing::Span;
 
-use super::hub::Subscription;
+use super::notifier::Subscription;
 use super::observe::Attempt;
 use super::{ResultEncoder, Solver};
 use crate::domain::job::{EventBody, JobEvent, JobName, Summary};
@@ -236,11 +236,11 @@ impl Observer for Reporter {
     }
 
     fn weights(&mut self, iteration: u32, weights: &[f32]) {
-        let topic = self.subscription.topic();
-        if topic.weights.receiver_count() == 0 {
+        let channel = self.subscription.channel();
+        if channel.weights.receiver_count() == 0 {
             return;
         }
-        topic.weights.send_replace(Some(Arc::new(JobEvent {
+        channel.weights.send_replace(Some(Arc::new(JobEvent {
             job: self.name.clone(),
             attempt: self.number,
             sequence: None,

@@ -323,7 +323,7 @@ async fn follow_store(health: Arc<Health>, mut store: watch::Receiver<StoreState
 
 /// Whether anyone should call a server whose store is so: on one that is full results are read, and room is made.
 fn is_of_use(store: StoreState) -> bool {
-    store != StoreState::Away
+    store != StoreState::Unavailable
 }
 
 /// The certificates, followed as their files change.

@@ -5,6 +5,7 @@
 
 mod clock;
 mod input_query;
+pub mod instrumented;
 pub mod payload;
 pub mod postgres;
 pub mod query;
@@ -13,7 +14,6 @@ pub mod record;
 pub(crate) mod simulated;
 mod sql;
 pub mod sqlite;
-pub mod timed;
 pub mod upload;
 
 #[cfg(test)]
@@ -31,9 +31,9 @@ pub use clock::Clock;
 pub use input_query::{InputPage, InputQuery};
 pub use query::{JobPage, JobQuery, Order};
 pub use record::{
-    Bound, CancelReply, Claim, Claimed, Claims, Created, EncodedResult, Ending, Heartbeat, JobInput, Lease, Load,
-    NewRecord, Outcome, Prefetch, QueueBounds, QueueReport, Request, RetryReply, StoreStats, Swept, TenantQueue,
-    TenantShares, WebhookOutcome, WebhookQueue, Work,
+    Bound, CancelReply, Claim, Claimed, Claims, Created, EncodedResult, Ending, Heartbeat, JobInput, JobPayload, Lease,
+    NewRecord, Outcome, Prefetch, QueueBounds, QueueReport, QueueStats, Request, RetryReply, StoreStats, Swept,
+    TenantQueue, TenantShares, WebhookOutcome, WebhookQueue,
 };
 pub use upload::{
     BegunUpload, NewInput, NewUpload, PurgedUploads, StoredInput, UploadBound, UploadBounds, UploadLease, UploadStatus,
@@ -110,16 +110,16 @@ pub enum TakenId {
     Upload(InputName, &'static str),
 }
 
-/// What another process may have changed.
+/// What another process has changed, as it says.
 #[derive(Debug, Clone, PartialEq, Eq)]
-pub enum Hint {
+pub enum Notification {
     /// The job has new events.
     Events(JobName),
     /// Something entered the queue.
     Queued,
     /// The cancel of a running job was asked for.
     Cancel(JobName),
-    /// Words may have been lost: anything may have changed.
+    /// Notifications may have been lost: anything may have changed.
     Missed,
 }
 
@@ -179,7 +179,7 @@ pub trait Store: Send + Sync + 'static {
     ///
     /// # Errors
     /// [`Error::NotFound`].
-    async fn work(&self, name: &JobName) -> Result<Work, Error>;
+    async fn job_payload(&self, name: &JobName) -> Result<JobPayload, Error>;
 
     /// Extends a lease and brings back what its holder must know.
     ///
@@ -349,7 +349,7 @@ pub trait Store: Send + Sync + 'static {
     ) -> Result<PurgedUploads, Error>;
 
     /// What waits and what runs.
-    async fn load(&self) -> Result<Load, Error>;
+    async fn queue_stats(&self) -> Result<QueueStats, Error>;
 
     /// What is to be sent to the webhooks of jobs that have ended.
     async fn webhook_queue(&self, now: SystemTime) -> Result<WebhookQueue, Error>;
@@ -378,10 +378,10 @@ pub trait Store: Send + Sync + 'static {
     /// operators to watch.
     fn has_room(&self) -> bool;
 
-    /// Waits for word of what another process changed. Words may be lost, repeated or stale: whoever heeds them looks
+    /// Waits for a change by another process. Notifications may be lost, repeated or stale: whoever handles them looks
     /// into the store, and looks from time to time without one. Never answers where the store is not shared. For one
     /// caller at a time.
-    async fn hint(&self) -> Hint;
+    async fn notification(&self) -> Notification;
 
     /// Closes every connection; what was acknowledged is durable without it.
     async fn close(&self);

@@ -102,18 +102,18 @@ impl QueueBounds {
 
     /// The bound that these jobs break by themselves, however little waits: together they never fit.
     pub fn never_takes(&self, batch: &[&NewRecord]) -> Option<Oversize> {
-        let mut whole = Load::default();
-        let mut tenants: BTreeMap<&str, Load> = BTreeMap::new();
+        let mut whole = QueueStats::default();
+        let mut tenants: BTreeMap<&str, QueueStats> = BTreeMap::new();
         for new in batch {
             whole.add(new);
             tenants.entry(&new.name.tenant).or_default().add(new);
         }
         // One job that waits alone may be of any size.
-        let of_several = |load: &Load, amount| if load.queued > 1 { amount } else { 0 };
-        let of_tenant = |load: &Load| {
+        let of_several = |stats: &QueueStats, amount| if stats.queued > 1 { amount } else { 0 };
+        let of_tenant = |stats: &QueueStats| {
             first_broken([
-                (Quota::TenantJobs, load.queued, self.max_tenant_jobs),
-                (Quota::TenantBytes, of_several(load, load.queued_bytes), self.max_tenant_bytes),
+                (Quota::TenantJobs, stats.queued, self.max_tenant_jobs),
+                (Quota::TenantBytes, of_several(stats, stats.queued_bytes), self.max_tenant_bytes),
             ])
         };
         tenants.values().find_map(of_tenant).or_else(|| {
@@ -126,33 +126,33 @@ impl QueueBounds {
     }
 
     /// The first bound that one more job would break: of the tenant's own, then of the whole queue's.
-    pub fn refuses(&self, whole: &Load, tenant: &Load, bytes: u64, observations: u64) -> Option<Bound> {
+    pub fn refuses(&self, whole: &QueueStats, tenant: &QueueStats, bytes: u64, observations: u64) -> Option<Bound> {
         self.refuses_tenant(tenant, bytes).or_else(|| self.refuses_all(whole, bytes, observations))
     }
 
-    fn refuses_tenant(&self, load: &Load, bytes: u64) -> Option<Bound> {
-        if load.queued >= self.max_tenant_jobs {
-            Some(Bound::TenantJobs { waiting: load.queued, max: self.max_tenant_jobs })
-        } else if load.queued > 0 && load.queued_bytes.saturating_add(bytes) > self.max_tenant_bytes {
+    fn refuses_tenant(&self, stats: &QueueStats, bytes: u64) -> Option<Bound> {
+        if stats.queued >= self.max_tenant_jobs {
+            Some(Bound::TenantJobs { waiting: stats.queued, max: self.max_tenant_jobs })
+        } else if stats.queued > 0 && stats.queued_bytes.saturating_add(bytes) > self.max_tenant_bytes {
             // As below: a tenant's job that waits alone always fits.
-            Some(Bound::TenantBytes { waiting: load.queued_bytes, max: self.max_tenant_bytes })
+            Some(Bound::TenantBytes { waiting: stats.queued_bytes, max: self.max_tenant_bytes })
         } else {
             None
         }
     }
 
-    fn refuses_all(&self, load: &Load, bytes: u64, observations: u64) -> Option<Bound> {
-        if load.queued >= self.max_jobs {
-            return Some(Bound::Jobs { waiting: load.queued, max: self.max_jobs });
+    fn refuses_all(&self, stats: &QueueStats, bytes: u64, observations: u64) -> Option<Bound> {
+        if stats.queued >= self.max_jobs {
+            return Some(Bound::Jobs { waiting: stats.queued, max: self.max_jobs });
         }
         // A job alone in the queue always fits: what is too large for an empty queue is refused by the limits on
         // inputs.
-        if load.queued == 0 {
+        if stats.queued == 0 {
             None
-        } else if load.queued_bytes.saturating_add(bytes) > self.max_bytes {
-            Some(Bound::Bytes { waiting: load.queued_bytes, max: self.max_bytes })
-        } else if load.queued_observations.saturating_add(observations) > self.max_observations {
-            Some(Bound::Observations { waiting: load.queued_observations, max: self.max_observations })
+        } else if stats.queued_bytes.saturating_add(bytes) > self.max_bytes {
+            Some(Bound::Bytes { waiting: stats.queued_bytes, max: self.max_bytes })
+        } else if stats.queued_observations.saturating_add(observations) > self.max_observations {
+            Some(Bound::Observations { waiting: stats.queued_observations, max: self.max_observations })
         } else {
             None
         }
@@ -204,7 +204,7 @@ impl fmt::Display for Bound {
 
 /// What waits and what runs.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
-pub struct Load {
+pub struct QueueStats {
     pub queued: u64,
     pub queued_bytes: u64,
     pub queued_observations: u64,
@@ -213,7 +213,7 @@ pub struct Load {
     pub paused: bool,
 }
 
-/// What operators watch; it takes longer to count than [`Load`].
+/// What operators watch; it takes longer to count than [`QueueStats`].
 #[derive(Debug, Clone, Default, PartialEq, Eq)]
 pub struct StoreStats {
     /// Bytes that the store takes.
@@ -224,7 +224,7 @@ pub struct StoreStats {
     pub tenants: Vec<TenantQueue>,
 }
 
-impl Load {
+impl QueueStats {
     /// One more job waits.
     pub fn add(&mut self, new: &NewRecord) {
         self.queued += 1;
@@ -313,9 +313,9 @@ pub struct Claimed {
     pub queue_time: SystemTime,
 }
 
-/// What there is to do for a job that is claimed.
+/// What a worker reads of a claimed job.
 #[derive(Debug, Clone, PartialEq, Eq)]
-pub struct Work {
+pub struct JobPayload {
     /// Encoded [`crate::domain::Input`], see [`super::payload`].
     pub input: Vec<u8>,
     pub cancel_requested: bool,

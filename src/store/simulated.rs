@@ -14,9 +14,9 @@ use tokio::sync::{OwnedMutexGuard, broadcast};
 use tokio::time::{Instant, sleep};
 
 use super::clock::LeaseClock;
-use super::sql::{Change, Connection, Database, Moves, Operation, Row, Size, Statement, micros};
+use super::sql::{Change, Connection, Database, Operation, Row, Size, Statement, WriteIntent, micros};
 use super::sqlite::{WriteConnection, WrittenRow};
-use super::{Clock, Error, Hint};
+use super::{Clock, Error, Notification};
 use crate::domain::job::JobName;
 
 /// Notifications that a server may be behind before it is told that some are lost.
@@ -77,7 +77,7 @@ impl Link {
 #[derive(Clone)]
 pub(crate) struct Cluster {
     connection: Arc<tokio::sync::Mutex<SimulatedConnection>>,
-    notifications: broadcast::Sender<Hint>,
+    notifications: broadcast::Sender<Notification>,
 }
 
 impl Cluster {
@@ -133,7 +133,7 @@ pub(crate) struct Simulated<const SHARED: bool> {
     /// The server's.
     wall_clock: Clock,
     lease_clock: LeaseClock,
-    notifications: tokio::sync::Mutex<broadcast::Receiver<Hint>>,
+    notifications: tokio::sync::Mutex<broadcast::Receiver<Notification>>,
 }
 
 /// Which way something is on the link.
@@ -192,16 +192,16 @@ impl<const SHARED: bool> Database for Simulated<SHARED> {
     async fn write<T: Send + 'static>(
         &self,
         _size: Size,
-        moves: Moves,
+        intent: WriteIntent,
         operation: Operation<SimulatedConnection, T>,
     ) -> Result<T, Error> {
         self.pass(Way::There).await?;
         let is_full = self.locked().faults.full;
         let outcome = {
             let mut connection = self.cluster.connection.lock().await;
-            let outcome = connection.transaction(&operation, is_full && matches!(moves, Moves::Begins(_))).await;
+            let outcome = connection.transaction(&operation, is_full && matches!(intent, WriteIntent::Begins(_))).await;
             for change in std::mem::take(&mut connection.committing) {
-                // Without a server that listens there is nobody to tell.
+                // Without a server that listens there is nobody to notify.
                 let _ = self.cluster.notifications.send(change);
             }
             outcome
@@ -240,17 +240,17 @@ impl<const SHARED: bool> Database for Simulated<SHARED> {
         !self.locked().faults.full
     }
 
-    async fn heard(&self) -> Hint {
+    async fn next_notification(&self) -> Notification {
         if !SHARED {
             return std::future::pending().await;
         }
         loop {
-            let heard = self.notifications.lock().await.recv().await;
+            let received = self.notifications.lock().await.recv().await;
             let Link { faults, rng, .. } = &mut *self.locked();
             if rng.random_bool(faults.lost_notifications) || faults.partitioned {
                 continue;
             }
-            return heard.unwrap_or(Hint::Missed);
+            return received.unwrap_or(Notification::Missed);
         }
     }
 
@@ -277,8 +277,8 @@ impl DerefMut for ReadConnection {
 /// The connection that all servers share.
 pub(crate) struct SimulatedConnection {
     inner: WriteConnection,
-    /// What others are told once the transaction is committed.
-    committing: Vec<Hint>,
+    /// Sent to the others once the transaction is committed.
+    committing: Vec<Notification>,
     bug: Option<Bug>,
     /// Reads of events so far.
     reads: u32,
@@ -340,11 +340,11 @@ impl Connection for SimulatedConnection {
         Ok(rows)
     }
 
-    async fn tell(&mut self, change: Change, job: &JobName) -> Result<(), Error> {
+    async fn notify(&mut self, change: Change, job: &JobName) -> Result<(), Error> {
         self.committing.push(match change {
-            Change::Events => Hint::Events(job.clone()),
-            Change::Queued => Hint::Queued,
-            Change::Cancel => Hint::Cancel(job.clone()),
+            Change::Events => Notification::Events(job.clone()),
+            Change::Queued => Notification::Queued,
+            Change::Cancel => Notification::Cancel(job.clone()),
         });
         Ok(())
     }

@@ -122,6 +122,6 @@ async fn a_hundred_jobs_of_twenty_callers_on_two_workers_all_end() {
     assert_eq!(names.len(), 100);
     // One that is prefetched while another slot begins it may be begun for nothing.
     assert!(bench.gate.calls.load(Ordering::SeqCst) >= 100);
-    assert_eq!(bench.engine.load().await.expect("counts"), crate::engine::Load::default());
-    eventually(|| async { (bench.engine.inner.hub.topic_count() == 0).then_some(()) }).await;
+    assert_eq!(bench.engine.queue_stats().await.expect("counts"), crate::engine::QueueStats::default());
+    eventually(|| async { (bench.engine.inner.notifier.channel_count() == 0).then_some(()) }).await;
 }

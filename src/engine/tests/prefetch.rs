@@ -26,7 +26,7 @@ async fn prefetched() -> (TestEngine, [JobName; 2]) {
 async fn handed_over(bench: &TestEngine, second: &JobName) {
     eventually(|| async { is_prefetched(bench, second).then_some(()) }).await;
     // It is listed before its input is read. What follows an attempt begins with handing it over.
-    eventually(|| async { (bench.engine.inner.hub.topic_count() == 2).then_some(()) }).await;
+    eventually(|| async { (bench.engine.inner.notifier.channel_count() == 2).then_some(()) }).await;
 }
 
 /// Until nothing is prefetched or running. A job's end is in the store a little before its attempt is off the list.

@@ -1,11 +1,11 @@
-//! Two engines on one PostgreSQL that hear nothing of each other: polls and heartbeats alone carry everything.
+//! Two engines on one PostgreSQL without notifications of each other: polls and heartbeats alone carry everything.
 
 use super::*;
 use crate::store::postgres::Postgres;
 use crate::store::postgres::tests::cluster;
 
 #[tokio::test]
-async fn without_hints_a_job_is_watched_and_cancelled_from_elsewhere() {
+async fn without_notifications_a_job_is_watched_and_cancelled_from_elsewhere() {
     let Some(cluster) = cluster::shared("engines that share a store") else { return };
     let url = cluster.database().await.parse().expect("an address");
     let gate = Arc::new(Gate::default());

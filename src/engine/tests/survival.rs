@@ -25,26 +25,26 @@ async fn a_drain_lets_what_runs_finish_and_leaves_what_waits() {
 }
 
 #[tokio::test]
-async fn who_is_in_a_hurry_waits_for_no_drain() {
+async fn interrupt_running_ends_the_wait_of_a_drain() {
     for before in [true, false] {
         let bench = TestEngine::start(workers(1)).await;
         let name = bench.submit(Script::Wait).await;
         bench.gate.until_waiting(1).await;
         if before {
-            bench.engine.hurry();
+            bench.engine.interrupt_running();
         }
         let engine = bench.engine.clone();
         let drain = tokio::spawn(async move { engine.drain(Duration::from_secs(3600)).await });
         eventually(|| async { bench.engine.is_draining().then_some(()) }).await;
         if !before {
-            bench.engine.hurry();
+            bench.engine.interrupt_running();
         }
         let drained = tokio::time::timeout(Duration::from_secs(120), drain).await.expect("an end").expect("no panic");
         assert_eq!(drained, Drained { finished: 0, given_back: 1 }, "before: {before}");
         assert_eq!(bench.engine.job(&name).await.expect("exists").state, JobState::Queued);
     }
     let idle = TestEngine::start(workers(1)).await;
-    idle.engine.hurry();
+    idle.engine.interrupt_running();
     assert_eq!(idle.engine.drain(Duration::from_secs(3600)).await, Drained::default(), "nothing runs");
 }
 
@@ -57,7 +57,7 @@ async fn those_who_follow_the_store_hear_of_changes_alone() {
             bench.engine.inner.sweep().await;
         }
     };
-    assert_eq!(*states.borrow_and_update(), StoreState::Sound);
+    assert_eq!(*states.borrow_and_update(), StoreState::Healthy);
     look().await;
     assert!(!states.has_changed().expect("an engine"), "nothing happened");
 
@@ -72,7 +72,7 @@ async fn those_who_follow_the_store_hear_of_changes_alone() {
     assert!(!states.has_changed().expect("an engine"), "it is as full as before");
 
     std::fs::remove_dir(&in_the_way).expect("removed");
-    let room = states.wait_for(|state| *state == StoreState::Sound);
+    let room = states.wait_for(|state| *state == StoreState::Healthy);
     tokio::time::timeout(Duration::from_secs(120), room).await.expect("room within two minutes").expect("an engine");
     // The next connection knows nothing of the limit.
     bench.store.execute("PRAGMA max_page_count = 1073741823").await;

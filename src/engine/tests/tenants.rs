@@ -17,7 +17,7 @@ async fn place_of_the_single_job(short_job: Duration, second_in_hand: bool) -> u
     let many = bench.engine.submit_batch(many).await.expect("admitted");
     bench.gate.until_waiting(1).await;
     if second_in_hand {
-        eventually(|| async { (bench.engine.inner.hub.topic_count() == 2).then_some(()) }).await;
+        eventually(|| async { (bench.engine.inner.notifier.channel_count() == 2).then_some(()) }).await;
     }
     let single = bench.engine.submit(of("b", Script::Succeed)).await.expect("admitted").name;
     bench.gate.open();

@@ -124,9 +124,9 @@ async fn watchers_that_come_and_go_miss_and_repeat_nothing() {
         })
         .collect();
     for iteration in 0..EVENTS {
-        // Through the store and the hub, as the engine does, only faster.
+        // Through the store and the notifier, as the engine does, only faster.
         bench.store.record(&lease, &progress(iteration), SystemTime::now()).await.expect("holds");
-        bench.engine.inner.hub.wake(&name);
+        bench.engine.inner.notifier.wake(&name);
     }
     bench.gate.open();
     let last = bench.ended(&name).await.last_sequence;
@@ -145,10 +145,10 @@ async fn a_watcher_that_leaves_is_forgotten_and_cancels_nothing() {
     let name = bench.submit(Script::Wait).await;
     bench.gate.until_waiting(1).await;
     let watches = futures_util::future::join_all((0..10).map(|_| bench.engine.watch(&name, 0))).await;
-    assert_eq!(bench.engine.inner.hub.topic_count(), 1);
+    assert_eq!(bench.engine.inner.notifier.channel_count(), 1);
     drop(watches);
     assert_eq!(bench.engine.job(&name).await.expect("exists").state, JobState::Running);
     bench.gate.open();
     assert_eq!(bench.ended(&name).await.state, JobState::Succeeded);
-    eventually(|| async { (bench.engine.inner.hub.topic_count() == 0).then_some(()) }).await;
+    eventually(|| async { (bench.engine.inner.notifier.channel_count() == 0).then_some(()) }).await;
 }

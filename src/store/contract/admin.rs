@@ -37,7 +37,7 @@ pub(in crate::store) async fn a_retried_job_begins_anew_and_its_events_go_on(sto
     assert_eq!((&job.labels, job.create_time), (&failed.labels, time(0)));
     assert_ne!(job.etag(), failed.etag());
     assert_eq!(store.job(&name).await, Ok(job.clone()));
-    assert_eq!(store.work(&name).await.map(|work| work.input), Ok(vec![7; 100]), "the input was kept");
+    assert_eq!(store.job_payload(&name).await.map(|payload| payload.input), Ok(vec![7; 100]), "the input was kept");
     // Kept for as long as any job that waits.
     assert_eq!(store.purge(time(1_000_000), 10).await, Ok(0));
     // Once more, as after an answer that was lost.
@@ -135,7 +135,7 @@ pub(in crate::store) async fn a_paused_queue_gives_out_no_job(store: &dyn Store)
         store.set_paused(true, time(seconds)).await.expect("pauses");
         assert_eq!(store.queue(1).await.expect("reports").pause_time, Some(time(3)), "since the first call");
     }
-    assert!(store.load().await.expect("counts").paused);
+    assert!(store.queue_stats().await.expect("counts").paused);
     assert_eq!(store.claim(&Claim::one("worker", LEASE), time(5)).await, Ok(Claims::default()));
     // What runs goes on, and what is new is taken in.
     store.heartbeat(&lease, time(5), LEASE).await.expect("holds");
@@ -146,7 +146,7 @@ pub(in crate::store) async fn a_paused_queue_gives_out_no_job(store: &dyn Store)
         store.set_paused(false, time(seconds)).await.expect("resumes");
         assert_eq!(store.queue(1).await.expect("reports").pause_time, None);
     }
-    assert!(!store.load().await.expect("counts").paused);
+    assert!(!store.queue_stats().await.expect("counts").paused);
     assert_eq!(claim(store, 10).await.job.name.job, "b");
 }
 

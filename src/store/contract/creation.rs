@@ -45,7 +45,7 @@ pub(in crate::store) async fn a_created_job_reads_back(store: &dyn Store) {
     };
     assert_eq!(created.job, expected);
     assert_eq!(store.job(&new.name).await, Ok(expected));
-    assert_eq!(store.work(&new.name).await.map(|work| work.input), Ok(input));
+    assert_eq!(store.job_payload(&new.name).await.map(|payload| payload.input), Ok(input));
     assert_eq!(result_of(store, &new.name).await, Ok(None));
     assert_eq!(story(store, &new.name).await, told(&[(1, 0, "QUEUED")]));
     let claimed = claim(store, 1).await;
@@ -82,7 +82,7 @@ pub(in crate::store) async fn one_request_id_from_many_callers_is_one_job(store:
     let created: Vec<_> = created.into_iter().map(|created| created.expect("created or known")).collect();
     assert_eq!(created.iter().filter(|created| created.new).count(), 1);
     assert!(created.iter().all(|other| other.job.name == created[0].job.name));
-    assert_eq!(store.load().await.expect("counts").queued, 1);
+    assert_eq!(store.queue_stats().await.expect("counts").queued, 1);
 }
 
 pub(in crate::store) async fn a_taken_job_id_is_refused(store: &dyn Store) {
@@ -101,16 +101,16 @@ pub(in crate::store) async fn admission_bounds_what_waits(store: &dyn Store) {
     let empty = QueueBounds { max_bytes: 0, max_observations: 0, ..ROOM };
     store.create_job(record("a"), &empty, time(0)).await.expect("one job alone always fits");
     create(store, record("b"), 0).await;
-    let load = store.load().await.expect("counts");
-    assert_eq!((load.queued, load.queued_bytes, load.queued_observations, load.running), (2, 200, 120, 0));
+    let stats = store.queue_stats().await.expect("counts");
+    assert_eq!((stats.queued, stats.queued_bytes, stats.queued_observations, stats.running), (2, 200, 120, 0));
     assert_eq!(refused(QueueBounds { max_jobs: 2, ..ROOM }).await, Bound::Jobs { waiting: 2, max: 2 });
     assert_eq!(refused(QueueBounds { max_bytes: 299, ..ROOM }).await, Bound::Bytes { waiting: 200, max: 299 });
     let bound = refused(QueueBounds { max_observations: 179, ..ROOM }).await;
     assert_eq!(bound, Bound::Observations { waiting: 120, max: 179 });
     assert!(matches!(store.job(&record("late").name).await, Err(Error::NotFound(_))), "nothing was stored");
     claim(store, 2).await;
-    let load = store.load().await.expect("counts");
-    assert_eq!((load.queued, load.queued_bytes, load.queued_observations, load.running), (1, 100, 60, 1));
+    let stats = store.queue_stats().await.expect("counts");
+    assert_eq!((stats.queued, stats.queued_bytes, stats.queued_observations, stats.running), (1, 100, 60, 1));
     let exact = QueueBounds { max_jobs: 2, max_bytes: 200, max_observations: 120, ..ROOM };
     store.create_job(record("c"), &exact, time(3)).await.expect("what runs does not wait");
 }
@@ -152,12 +152,12 @@ pub(in crate::store) async fn a_batch_is_stored_whole_or_not_at_all(store: &dyn 
     let error = store.create_jobs(batch[..2].to_vec(), &bounds, time(1)).await.expect_err("full");
     assert_eq!(error, Error::QueueFull(Bound::Jobs { waiting: 2, max: 2 }));
     assert!(matches!(store.job(&record("a").name).await, Err(Error::NotFound(_))), "nothing was stored");
-    assert_eq!(store.load().await.expect("counts").queued, 1);
+    assert_eq!(store.queue_stats().await.expect("counts").queued, 1);
     let created = store.create_jobs(batch[..2].to_vec(), &ROOM, time(1)).await.expect("created");
     let created: Vec<_> = created.iter().map(|created| (created.job.name.job.as_str(), created.new)).collect();
     assert_eq!(created, [("a", true), ("b", true)]);
-    assert_eq!(store.load().await.expect("counts").queued_bytes, 300);
-    assert_eq!(store.work(&record("b").name).await.map(|work| work.input), Ok(vec![7; 100]));
+    assert_eq!(store.queue_stats().await.expect("counts").queued_bytes, 300);
+    assert_eq!(store.job_payload(&record("b").name).await.map(|payload| payload.input), Ok(vec![7; 100]));
 }
 
 pub(in crate::store) async fn a_batch_knows_its_request_ids(store: &dyn Store) {
@@ -179,7 +179,7 @@ pub(in crate::store) async fn a_batch_knows_its_request_ids(store: &dyn Store) {
     other[0] = record("new");
     let error = store.create_jobs(other, &ROOM, time(1)).await.expect_err("another body");
     assert!(matches!(error, Error::AlreadyExists(_)), "{error}");
-    assert_eq!(store.load().await.expect("counts").queued, 2);
+    assert_eq!(store.queue_stats().await.expect("counts").queued, 2);
 }
 
 pub(in crate::store) async fn a_batch_that_never_fits_is_told_so(store: &dyn Store) {

@@ -1,7 +1,7 @@
 //! Leases: who may write, and where a job goes that ends, is given back or is lost.
 
 use super::*;
-use crate::store::{Claims, Load, Prefetch};
+use crate::store::{Claims, Prefetch, QueueStats};
 
 pub(in crate::store) async fn claims_go_by_priority_then_age(store: &dyn Store) {
     for (job, priority, seconds) in [("old", 0, 0), ("new", 0, 2), ("same", 0, 2), ("low", -1, 0), ("high", 5, 9)] {
@@ -217,7 +217,7 @@ pub(in crate::store) async fn every_outcome_ends_in_its_state(store: &dyn Store)
         assert_eq!(job.failure, (state == JobState::Failed).then(|| failure.clone()));
         assert_eq!(story(store, &name).await, told(&[(1, 0, "QUEUED"), (2, 1, "RUNNING"), (3, 1, event)]));
     }
-    assert_eq!(store.load().await, Ok(Load::default()));
+    assert_eq!(store.queue_stats().await, Ok(QueueStats::default()));
 }
 
 pub(in crate::store) async fn giving_back_is_free_and_vanishing_is_not(store: &dyn Store) {

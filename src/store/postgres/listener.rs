@@ -6,7 +6,7 @@ use sqlx::postgres::{PgConnectOptions, PgListener, PgNotification, PgPool, PgPoo
 
 use crate::domain::job::JobName;
 use crate::store::sql::Change;
-use crate::store::{Error, Hint};
+use crate::store::{Error, Notification};
 
 /// Pause before the next try to listen, while the database is away; polls go on meanwhile.
 const RETRY_PAUSE: Duration = Duration::from_secs(1);
@@ -18,7 +18,7 @@ const EVENTS: &str = "scpsfm_events";
 const QUEUED: &str = "scpsfm_queued";
 const CANCEL: &str = "scpsfm_cancel";
 
-/// The channel on which a change is told; the payload is the job's name.
+/// The channel that notifies of a change; the payload is the job's name.
 pub(super) fn channel(change: Change) -> &'static str {
     match change {
         Change::Events => EVENTS,
@@ -45,14 +45,14 @@ impl Listener {
         Self { options, current: None }
     }
 
-    /// The next word. The first one after a connection, and after one that broke, is [`Hint::Missed`].
-    pub(super) async fn hint(&mut self) -> Hint {
+    /// The next notification. The first one after a connection, and after one that broke, is [`Notification::Missed`].
+    pub(super) async fn next(&mut self) -> Notification {
         loop {
             let Some((_, listener)) = &mut self.current else {
                 match listen(&self.options).await {
                     Ok(listening) => {
                         self.current = Some(listening);
-                        return Hint::Missed;
+                        return Notification::Missed;
                     }
                     Err(error) => {
                         tracing::debug!(%error, "cannot listen for other servers");
@@ -62,9 +62,9 @@ impl Listener {
                 }
             };
             match listener.try_recv().await {
-                Ok(Some(notification)) => {
-                    if let Some(hint) = understood(&notification) {
-                        return hint;
+                Ok(Some(received)) => {
+                    if let Some(notification) = parse(&received) {
+                        return notification;
                     }
                 }
                 Ok(None) => self.current = None,
@@ -100,12 +100,12 @@ async fn listen(options: &PgConnectOptions) -> Result<(PgPool, PgListener), Erro
 }
 
 /// What a notification says; `None` for one that is not ours.
-fn understood(notification: &PgNotification) -> Option<Hint> {
-    let job = || JobName::parse(notification.payload());
-    match notification.channel() {
-        EVENTS => job().map(Hint::Events),
-        CANCEL => job().map(Hint::Cancel),
-        QUEUED => Some(Hint::Queued),
+fn parse(received: &PgNotification) -> Option<Notification> {
+    let job = || JobName::parse(received.payload());
+    match received.channel() {
+        EVENTS => job().map(Notification::Events),
+        CANCEL => job().map(Notification::Cancel),
+        QUEUED => Some(Notification::Queued),
         _ => None,
     }
 }

@@ -1,8 +1,7 @@
 //! The shared store: PostgreSQL, which several servers use as one.
 //!
 //! Every write of a worker is conditioned on its lease under the job's row lock, so that of two servers that think they
-//! hold a job one is refused. Notifications carry the names of jobs and are hints: what they say is read from the
-//! tables.
+//! hold a job one is refused. Notifications carry the names of jobs: what they say is read from the tables.
 
 mod listener;
 #[cfg(test)]
@@ -20,8 +19,8 @@ use tokio::sync::Mutex;
 use tokio::time::{Instant, timeout};
 
 use super::clock::LeaseClock;
-use super::sql::{self, Change, Connection, Database, Lock, Moves, Operation, Row, Size, Statement};
-use super::{Clock, Error, Hint};
+use super::sql::{self, Change, Connection, Database, Lock, Operation, Row, Size, Statement, WriteIntent};
+use super::{Clock, Error, Notification};
 use crate::domain::job::JobName;
 use listener::Listener;
 pub use url::{DatabaseUrl, UrlError};
@@ -67,7 +66,7 @@ pub struct Postgres {
     payloads: PgPool,
     clock: LeaseClock,
     listener: Mutex<Listener>,
-    /// Hears nothing, for tests of what polls alone achieve.
+    /// Gets no notifications, for tests of what polls alone achieve.
     #[cfg(test)]
     pub(crate) deaf: bool,
 }
@@ -148,7 +147,7 @@ impl Connection for PgConnection {
         self.execute(Statement::new("SELECT pg_advisory_xact_lock($1)").bind(key)).await
     }
 
-    async fn tell(&mut self, change: Change, job: &JobName) -> Result<(), Error> {
+    async fn notify(&mut self, change: Change, job: &JobName) -> Result<(), Error> {
         let notify = Statement::new("SELECT pg_notify($1, $2)").bind(listener::channel(change));
         self.execute(notify.bind(&job.to_string())).await
     }
@@ -167,7 +166,7 @@ impl Database for Postgres {
     async fn write<T: Send + 'static>(
         &self,
         size: Size,
-        _moves: Moves,
+        _intent: WriteIntent,
         operation: Operation<PgConnection, T>,
     ) -> Result<T, Error> {
         let mut transaction = self.pool(size).begin().await?;
@@ -207,12 +206,12 @@ impl Database for Postgres {
         Ok(u64::try_from(row.integer("bytes")?).unwrap_or(0))
     }
 
-    async fn heard(&self) -> Hint {
+    async fn next_notification(&self) -> Notification {
         #[cfg(test)]
         if self.deaf {
             return std::future::pending().await;
         }
-        self.listener.lock().await.hint().await
+        self.listener.lock().await.next().await
     }
 
     async fn disconnect(&self) {

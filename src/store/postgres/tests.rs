@@ -104,7 +104,7 @@ async fn many_servers_share_one_queue_and_one_set_of_request_ids() {
     assert!(refused.clone().all(|error| matches!(error, Error::QueueFull(_))), "{:?}", refused.collect::<Vec<_>>());
     let requests = created.chunks(5).filter(|same| same.iter().any(Result::is_ok)).count();
     assert_eq!(requests, 10, "one request id is one job");
-    assert_eq!(fixture.load().await.expect("counts").queued, 10);
+    assert_eq!(fixture.queue_stats().await.expect("counts").queued, 10);
 
     let claim = &Claim::one("w", LEASE);
     let claims = (0..30).map(|number| {
@@ -114,8 +114,8 @@ async fn many_servers_share_one_queue_and_one_set_of_request_ids() {
     let claims = futures_util::future::join_all(claims).await;
     let claimed = claims.into_iter().filter_map(|claims| claims.expect("claims").begun).map(|claimed| claimed.job.name);
     told_once(claimed.collect());
-    let load = fixture.load().await.expect("counts");
-    assert_eq!((load.queued, load.running), (0, 10));
+    let stats = fixture.queue_stats().await.expect("counts");
+    assert_eq!((stats.queued, stats.running), (0, 10));
     // And what they lose is taken back once, whoever sweeps.
     let sweeps = servers.iter().map(|server| persistent(move || server.sweep(contract::time(60), 3)));
     let swept = futures_util::future::join_all(sweeps).await;
@@ -158,16 +158,16 @@ where
 async fn changes_are_told_to_other_servers_by_name_and_after_the_commit() {
     let Some(fixture) = Fixture::open().await else { return };
     let other = Postgres::open(&fixture.url).await.expect("a second server");
-    assert_eq!(other.hint().await, Hint::Missed, "from here on it listens");
+    assert_eq!(other.notification().await, Notification::Missed, "from here on it listens");
     let name = contract::record("a").name;
     fixture.create_job(contract::record("a"), &contract::ROOM, contract::time(0)).await.expect("created");
-    let told = [other.hint().await, other.hint().await];
-    assert_eq!(told, [Hint::Events(name.clone()), Hint::Queued]);
+    let notified = [other.notification().await, other.notification().await];
+    assert_eq!(notified, [Notification::Events(name.clone()), Notification::Queued]);
     assert_eq!(other.job(&name).await.expect("is there").last_sequence, 1);
     fixture.claim(&Claim::one("w", LEASE), contract::time(1)).await.expect("claims").begun.expect("a job");
-    assert_eq!(other.hint().await, Hint::Events(name.clone()));
+    assert_eq!(other.notification().await, Notification::Events(name.clone()));
     fixture.request_cancel(&name, None, contract::time(2)).await.expect("flags");
-    assert_eq!(other.hint().await, Hint::Cancel(name));
+    assert_eq!(other.notification().await, Notification::Cancel(name));
 }
 
 #[tokio::test]
@@ -187,13 +187,13 @@ async fn a_database_that_is_away_is_told_soon_and_used_again_by_itself() {
     let url: DatabaseUrl = cluster.database().await.parse().expect("an address");
     let store = Postgres::open(&url).await.expect("opens");
     store.create_job(contract::record("a"), &contract::ROOM, contract::time(0)).await.expect("created");
-    assert_eq!(store.hint().await, Hint::Missed);
+    assert_eq!(store.notification().await, Notification::Missed);
     cluster.stop();
     let error = store.job(&contract::record("a").name).await.expect_err("away");
     assert!(matches!(&error, Error::Unavailable(cause) if !cause.contains(cluster::PASSWORD)), "{error}");
     cluster.restart();
     store.job(&contract::record("a").name).await.expect("back");
-    assert_eq!(store.hint().await, Hint::Missed, "what was told meanwhile is lost, which is told");
+    assert_eq!(store.notification().await, Notification::Missed, "what was sent meanwhile is lost, which is reported");
 }
 
 #[tokio::test]

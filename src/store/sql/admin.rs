@@ -4,7 +4,7 @@ use std::time::SystemTime;
 
 use super::jobs::{self, Waiting};
 use super::removal::check_etag;
-use super::rows::{self, Departure, leave, micros, number, returning_job, standing};
+use super::rows::{self, Transition, locked_job, micros, number, returning_job};
 use super::{Change, Connection, Lock, Row, Statement, webhooks};
 use crate::domain::job::{Job, JobName, JobState};
 use crate::store::Error;
@@ -20,7 +20,7 @@ pub(super) async fn retry<C: Connection>(
 ) -> Result<RetryReply, Error> {
     // Before the job's row, as whoever creates jobs takes them: two in the other order would wait for each other.
     connection.take_lock(Lock::Admission).await?;
-    let job = standing(connection, name).await?;
+    let job = locked_job(connection, name).await?;
     check_etag(connection, name, etag).await?;
     match job.state {
         JobState::Queued | JobState::Running => {
@@ -45,7 +45,7 @@ pub(super) async fn retry<C: Connection>(
     );
     connection.execute(anew.bind(micros(now)).bind(job.id)).await?;
     webhooks::renew(connection, job.id).await?;
-    let job = leave(connection, &job, Departure::to(JobState::Queued), now).await?;
+    let job = rows::transition(connection, &job, Transition::to(JobState::Queued), now).await?;
     Ok(RetryReply { job, queued_now: true })
 }
 
@@ -56,7 +56,7 @@ pub(super) async fn set_priority<C: Connection>(
     etag: Option<&str>,
     priority: i32,
 ) -> Result<Job, Error> {
-    let job = standing(connection, name).await?;
+    let job = locked_job(connection, name).await?;
     check_etag(connection, name, etag).await?;
     if job.state != JobState::Queued {
         return Err(Error::NotQueued(name.clone(), job.state));
@@ -75,7 +75,7 @@ pub(super) async fn set_paused<C: Connection>(connection: &mut C, paused: bool, 
     // Only where a job waits is there anything to tell of.
     let waiting = Statement::new("SELECT tenant, job FROM jobs WHERE state = 'QUEUED' LIMIT 1");
     match connection.optional_row(waiting).await? {
-        Some(row) => connection.tell(Change::Queued, &rows::name(&row)?).await,
+        Some(row) => connection.notify(Change::Queued, &rows::name(&row)?).await,
         None => Ok(()),
     }
 }

@@ -3,8 +3,8 @@
 use std::time::SystemTime;
 
 use super::rows::{
-    self, Departure, Standing, end_attempt, held, insert_event, integer, leave, micros, number, select_standing,
-    standing,
+    self, LockedJob, Transition, end_attempt, held, insert_event, integer, locked_job, micros, number,
+    select_locked_job,
 };
 use super::{Change, Connection, Row, Statement, jobs, removal};
 use crate::domain::job::{AttemptEnd, EventBody, Failure, Job, JobName, JobState, PastAttempt};
@@ -43,7 +43,7 @@ pub(super) async fn record<C: Connection>(
         .bind(job.id);
     let event = insert_event(job.id, sequence, job.attempt, &EventBody::Progress(*progress), now)?;
     connection.batch(vec![update, event]).await?;
-    connection.tell(Change::Events, &job.name).await?;
+    connection.notify(Change::Events, &job.name).await?;
     Ok(sequence)
 }
 
@@ -55,24 +55,24 @@ pub(super) async fn finish<C: Connection>(
     now: SystemTime,
 ) -> Result<Job, Error> {
     let job = held(connection, lease).await?;
-    let mut departure = match &ending.outcome {
+    let mut transition = match &ending.outcome {
         Outcome::Succeeded { summary, result } => {
             for chunk in result_chunks(job.id, &result.bytes) {
                 connection.execute(chunk).await?;
             }
-            Departure {
+            Transition {
                 summary: Some(summary),
                 result_sha256: Some(&result.sha256),
-                ..Departure::to(JobState::Succeeded)
+                ..Transition::to(JobState::Succeeded)
             }
         }
-        Outcome::Failed(failure) => Departure { failure: Some(failure.clone()), ..Departure::to(JobState::Failed) },
-        Outcome::Cancelled => Departure::to(JobState::Cancelled),
-        Outcome::DeadlineExceeded => Departure::to(JobState::DeadlineExceeded),
+        Outcome::Failed(failure) => Transition { failure: Some(failure.clone()), ..Transition::to(JobState::Failed) },
+        Outcome::Cancelled => Transition::to(JobState::Cancelled),
+        Outcome::DeadlineExceeded => Transition::to(JobState::DeadlineExceeded),
     };
-    departure.progress = ending.progress.as_ref();
-    departure.attempt_end = Some(AttemptEnd::Ended);
-    leave(connection, &job, departure, now).await
+    transition.progress = ending.progress.as_ref();
+    transition.attempt_end = Some(AttemptEnd::Ended);
+    rows::transition(connection, &job, transition, now).await
 }
 
 /// What stores a result, chunk by chunk.
@@ -87,8 +87,8 @@ fn result_chunks(id: i64, bytes: &[u8]) -> impl Iterator<Item = Statement> + Sen
 pub(super) async fn release<C: Connection>(connection: &mut C, lease: &Lease, now: SystemTime) -> Result<Job, Error> {
     let job = held(connection, lease).await?;
     let next = if job.cancel_requested { JobState::Cancelled } else { JobState::Queued };
-    let departure = Departure { attempt_end: Some(AttemptEnd::GivenBack), ..Departure::to(next) };
-    leave(connection, &job, departure, now).await
+    let transition = Transition { attempt_end: Some(AttemptEnd::GivenBack), ..Transition::to(next) };
+    rows::transition(connection, &job, transition, now).await
 }
 
 /// Asks for the end of a job.
@@ -98,16 +98,16 @@ pub(super) async fn request_cancel<C: Connection>(
     etag: Option<&str>,
     now: SystemTime,
 ) -> Result<CancelReply, Error> {
-    let job = standing(connection, name).await?;
+    let job = locked_job(connection, name).await?;
     removal::check_etag(connection, name, etag).await?;
     let ended_now = job.state == JobState::Queued;
     if ended_now {
-        leave(connection, &job, Departure::to(JobState::Cancelled), now).await?;
+        rows::transition(connection, &job, Transition::to(JobState::Cancelled), now).await?;
     } else if job.state == JobState::Running {
         connection
             .execute(Statement::new("UPDATE jobs SET cancel_requested = TRUE WHERE id = $1").bind(job.id))
             .await?;
-        connection.tell(Change::Cancel, name).await?;
+        connection.notify(Change::Cancel, name).await?;
     }
     Ok(CancelReply { job: jobs::get(connection, name).await?, ended_now })
 }
@@ -119,7 +119,7 @@ pub(super) async fn take_back<C: Connection>(
     now: SystemTime,
     max_attempts: u32,
 ) -> Result<Vec<Job>, Error> {
-    let select = Statement::new(select_standing!("WHERE state = 'RUNNING' AND lease_expires <= $1 ORDER BY id"))
+    let select = Statement::new(select_locked_job!("WHERE state = 'RUNNING' AND lease_expires <= $1 ORDER BY id"))
         .bind(expired_at.map_or(i64::MAX, micros))
         .then(C::SKIP_LOCKED);
     if expired_at.is_none() {
@@ -130,7 +130,7 @@ pub(super) async fn take_back<C: Connection>(
     }
     let mut changed = Vec::new();
     for row in connection.rows(select).await? {
-        let job = Standing::from_row(&row)?;
+        let job = LockedJob::from_row(&row)?;
         let lost_attempts = job.lost_attempts + 1;
         let update = Statement::new("UPDATE jobs SET lost_attempts = $1 WHERE id = $2");
         connection.execute(update.bind(lost_attempts).bind(job.id)).await?;
@@ -140,14 +140,14 @@ pub(super) async fn take_back<C: Connection>(
             JobState::Failed => Some(exhausted(connection, &job, lost_attempts, max_attempts).await?),
             _ => None,
         };
-        let departure = Departure { failure, ..Departure::to(next) };
-        changed.push(leave(connection, &job, departure, now).await?);
+        let transition = Transition { failure, ..Transition::to(next) };
+        changed.push(rows::transition(connection, &job, transition, now).await?);
     }
     Ok(changed)
 }
 
 /// Where a job goes whose worker vanished.
-fn after_loss(job: &Standing, lost_attempts: u32, now: SystemTime, max_attempts: u32) -> JobState {
+fn after_loss(job: &LockedJob, lost_attempts: u32, now: SystemTime, max_attempts: u32) -> JobState {
     if job.cancel_requested {
         JobState::Cancelled
     } else if job.deadline.is_some_and(|deadline| deadline <= now) {
@@ -162,7 +162,7 @@ fn after_loss(job: &Standing, lost_attempts: u32, now: SystemTime, max_attempts:
 /// Why a job failed that lost too many attempts, and what became of each.
 async fn exhausted<C: Connection>(
     connection: &mut C,
-    job: &Standing,
+    job: &LockedJob,
     lost_attempts: u32,
     max_attempts: u32,
 ) -> Result<Failure, Error> {
@@ -211,15 +211,15 @@ pub(super) async fn needs_sweep<C: Connection>(
 /// Ends queued jobs that are past their deadline, at most a hundred: the next sweep, a second later, takes the others,
 /// and none takes longer than an operation may.
 pub(super) async fn expire_queued<C: Connection>(connection: &mut C, now: SystemTime) -> Result<Vec<Job>, Error> {
-    let select = Statement::new(select_standing!(
+    let select = Statement::new(select_locked_job!(
         "WHERE state = 'QUEUED' AND deadline IS NOT NULL AND deadline <= $1 ORDER BY id LIMIT 100"
     ))
     .bind(micros(now))
     .then(C::SKIP_LOCKED);
     let mut changed = Vec::new();
     for row in connection.rows(select).await? {
-        let job = Standing::from_row(&row)?;
-        changed.push(leave(connection, &job, Departure::to(JobState::DeadlineExceeded), now).await?);
+        let job = LockedJob::from_row(&row)?;
+        changed.push(rows::transition(connection, &job, Transition::to(JobState::DeadlineExceeded), now).await?);
     }
     Ok(changed)
 }

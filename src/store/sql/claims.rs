@@ -5,7 +5,7 @@
 
 use std::time::SystemTime;
 
-use super::rows::{self, Standing, insert_event, integer, micros, returning_job, select_standing};
+use super::rows::{self, LockedJob, insert_event, integer, micros, returning_job, select_locked_job};
 use super::{Change, Connection, Lock, Row, Statement, fairness};
 use crate::domain::job::{EventBody, JobState};
 use crate::store::Error;
@@ -55,9 +55,9 @@ async fn next<C: Connection>(
     max_observations: u32,
     now: SystemTime,
     lease_now: SystemTime,
-) -> Result<Option<Standing>, Error> {
+) -> Result<Option<LockedJob>, Error> {
     for tenant in fairness::turns(connection, &claim.shares, lease_now).await? {
-        let first = Statement::new(select_standing!(
+        let first = Statement::new(select_locked_job!(
             "WHERE state = 'QUEUED' AND tenant = $1 AND (deadline IS NULL OR deadline > $2) \
              AND (lease_expires IS NULL OR lease_expires <= $3) ORDER BY priority DESC, create_time, id LIMIT 1"
         ))
@@ -66,7 +66,7 @@ async fn next<C: Connection>(
         .bind(micros(lease_now))
         .then(C::SKIP_LOCKED);
         if let Some(row) = connection.optional_row(first).await? {
-            let job = Standing::from_row(&row)?;
+            let job = LockedJob::from_row(&row)?;
             return Ok(Some(job).filter(|job| job.observation_count <= max_observations));
         }
     }
@@ -81,10 +81,10 @@ async fn prefetched<C: Connection>(
     created: SystemTime,
     now: SystemTime,
     lease_now: SystemTime,
-) -> Result<Option<Standing>, Error> {
+) -> Result<Option<LockedJob>, Error> {
     // One whose lease has expired is not among those that are counted for the bound.
     let expires_after = claim.shares.max_running.map_or(i64::MIN, |_| micros(lease_now));
-    let same = Statement::new(select_standing!(
+    let same = Statement::new(select_locked_job!(
         "WHERE tenant = $1 AND job = $2 AND attempt = $3 AND create_time = $4 AND state = 'QUEUED' \
          AND (deadline IS NULL OR deadline > $5) AND lease_worker = $6 AND lease_expires > $7 \
          AND (SELECT pause_time FROM queue) IS NULL"
@@ -97,7 +97,7 @@ async fn prefetched<C: Connection>(
     .bind(&claim.worker)
     .bind(expires_after)
     .then(C::FOR_UPDATE);
-    connection.optional_row(same).await?.as_ref().map(Standing::from_row).transpose()
+    connection.optional_row(same).await?.as_ref().map(LockedJob::from_row).transpose()
 }
 
 /// A job that any worker has prefetched: it would wait for that worker, and this one is idle. There are as many as
@@ -106,8 +106,8 @@ async fn prefetched_by_any<C: Connection>(
     connection: &mut C,
     now: SystemTime,
     lease_now: SystemTime,
-) -> Result<Option<Standing>, Error> {
-    let first = Statement::new(select_standing!(
+) -> Result<Option<LockedJob>, Error> {
+    let first = Statement::new(select_locked_job!(
         "WHERE state = 'QUEUED' AND lease_expires IS NOT NULL AND lease_expires > $1 \
          AND (deadline IS NULL OR deadline > $2) AND (SELECT pause_time FROM queue) IS NULL \
          ORDER BY priority DESC, create_time, id LIMIT 1"
@@ -115,14 +115,14 @@ async fn prefetched_by_any<C: Connection>(
     .bind(micros(lease_now))
     .bind(micros(now))
     .then(C::SKIP_LOCKED);
-    connection.optional_row(first).await?.as_ref().map(Standing::from_row).transpose()
+    connection.optional_row(first).await?.as_ref().map(LockedJob::from_row).transpose()
 }
 
 /// Begins an attempt at a queued job.
 async fn begin<C: Connection>(
     connection: &mut C,
     claim: &Claim,
-    job: &Standing,
+    job: &LockedJob,
     now: SystemTime,
     lease_now: SystemTime,
 ) -> Result<Claimed, Error> {
@@ -146,7 +146,7 @@ async fn begin<C: Connection>(
     let event = insert_event(job.id, sequence, attempt, &event, now)?;
     let count = fairness::count::<C>(&claim.shares, &job.name.tenant);
     let rows = connection.batch(vec![lease, begin, event, count]).await?;
-    connection.tell(Change::Events, &job.name).await?;
+    connection.notify(Change::Events, &job.name).await?;
     let changed = rows.first().ok_or_else(|| Error::Corrupt("a job that was just leased is not there".into()))?;
     claimed(changed, 0)
 }

@@ -8,7 +8,7 @@ use super::{Change, Connection, Lock, Row, Statement, fairness, uploads, webhook
 use crate::domain::job::{EventBody, Job, JobEvent, JobName, JobState};
 use crate::domain::{InputName, Webhook};
 use crate::store::record::{
-    Created, EncodedResult, JobInput, Load, NewRecord, QueueBounds, Request, TenantQueue, Work,
+    Created, EncodedResult, JobInput, JobPayload, NewRecord, QueueBounds, QueueStats, Request, TenantQueue,
 };
 use crate::store::{Error, JobPage, JobQuery, Order, TakenId, payload};
 
@@ -91,8 +91,8 @@ async fn check_size<C: Connection>(connection: &mut C, news: &[NewRecord], bound
 /// What waits, as admission needs it: summed up once a batch, since a sum goes through the whole queue.
 #[derive(Default)]
 pub(super) struct Waiting {
-    whole: Option<Load>,
-    tenants: HashMap<String, Load>,
+    whole: Option<QueueStats>,
+    tenants: HashMap<String, QueueStats>,
 }
 
 impl Waiting {
@@ -102,27 +102,27 @@ impl Waiting {
         connection: &mut C,
         tenant: &str,
         bounds: &QueueBounds,
-    ) -> Result<(Load, Load), Error> {
+    ) -> Result<(QueueStats, QueueStats), Error> {
         let whole = match self.whole {
             Some(whole) => whole,
-            None => load(connection).await?,
+            None => queue_stats(connection).await?,
         };
         self.whole = Some(whole);
         if !bounds.has_tenant_bounds() {
-            return Ok((whole, Load::default()));
+            return Ok((whole, QueueStats::default()));
         }
         if let Some(known) = self.tenants.get(tenant) {
             return Ok((whole, *known));
         }
-        let of_tenant = load_of(connection, tenant).await?;
+        let of_tenant = tenant_queue_stats(connection, tenant).await?;
         self.tenants.insert(tenant.to_owned(), of_tenant);
         Ok((whole, of_tenant))
     }
 
     /// One more job is stored.
     fn add(&mut self, new: &NewRecord) {
-        for load in self.whole.iter_mut().chain(self.tenants.get_mut(&new.name.tenant)) {
-            load.add(new);
+        for stats in self.whole.iter_mut().chain(self.tenants.get_mut(&new.name.tenant)) {
+            stats.add(new);
         }
     }
 }
@@ -159,8 +159,8 @@ async fn enqueue<C: Connection>(
         connection.execute(webhooks::insert(id, &webhook)?).await?;
         job.webhook = Some(webhook);
     }
-    connection.tell(Change::Events, &new.name).await?;
-    connection.tell(Change::Queued, &new.name).await?;
+    connection.notify(Change::Events, &new.name).await?;
+    connection.notify(Change::Queued, &new.name).await?;
     Ok(job)
 }
 
@@ -377,7 +377,7 @@ pub(super) async fn events_after<C: Connection>(
 }
 
 /// The encoded input of a job, and whether its cancel was asked for.
-pub(super) async fn work<C: Connection>(connection: &mut C, name: &JobName) -> Result<Work, Error> {
+pub(super) async fn job_payload<C: Connection>(connection: &mut C, name: &JobName) -> Result<JobPayload, Error> {
     let select = Statement::new(
         "SELECT data, cancel_requested FROM jobs JOIN input_chunks ON input_chunks.input_id = jobs.input_id \
          WHERE tenant = $1 AND job = $2 ORDER BY chunk",
@@ -385,7 +385,7 @@ pub(super) async fn work<C: Connection>(connection: &mut C, name: &JobName) -> R
     let chunks = connection.rows(select.bind(&name.tenant).bind(&name.job)).await?;
     // An encoded input has a byte at least, and so a chunk.
     let first = chunks.first().ok_or_else(|| Error::NotFound(name.clone()))?;
-    Ok(Work { cancel_requested: first.flag("cancel_requested")?, input: joined(&chunks)? })
+    Ok(JobPayload { cancel_requested: first.flag("cancel_requested")?, input: joined(&chunks)? })
 }
 
 /// The encoded result of a job, if it has one.
@@ -411,7 +411,7 @@ pub(super) fn joined(chunks: &[impl Row]) -> Result<Vec<u8>, Error> {
 }
 
 /// What waits and what runs.
-pub(super) async fn load<C: Connection>(connection: &mut C) -> Result<Load, Error> {
+pub(super) async fn queue_stats<C: Connection>(connection: &mut C) -> Result<QueueStats, Error> {
     // Sums of 64-bit numbers have a wider type of their own in PostgreSQL.
     let select = Statement::new(
         "SELECT COUNT(*) AS queued, CAST(COALESCE(SUM(input_bytes), 0) AS BIGINT) AS bytes, \
@@ -444,7 +444,7 @@ pub(super) async fn by_tenant<C: Connection>(
 }
 
 /// What waits of one tenant; what runs is not counted.
-async fn load_of<C: Connection>(connection: &mut C, tenant: &str) -> Result<Load, Error> {
+async fn tenant_queue_stats<C: Connection>(connection: &mut C, tenant: &str) -> Result<QueueStats, Error> {
     let select = Statement::new(
         "SELECT COUNT(*) AS queued, CAST(COALESCE(SUM(input_bytes), 0) AS BIGINT) AS bytes, \
          CAST(COALESCE(SUM(observation_count), 0) AS BIGINT) AS observations, CAST(0 AS BIGINT) AS running, \
@@ -453,8 +453,8 @@ async fn load_of<C: Connection>(connection: &mut C, tenant: &str) -> Result<Load
     measured(&connection.row(select.bind(tenant)).await?)
 }
 
-fn measured(row: &impl Row) -> Result<Load, Error> {
-    Ok(Load {
+fn measured(row: &impl Row) -> Result<QueueStats, Error> {
+    Ok(QueueStats {
         queued: number(row, "queued")?,
         queued_bytes: number(row, "bytes")?,
         queued_observations: number(row, "observations")?,

@@ -22,7 +22,7 @@ use futures_util::future::BoxFuture;
 use sqlx::SqlSafeStr;
 use sqlx::migrate::{Migration, MigrationType, Migrator};
 
-use super::{Error, Hint};
+use super::{Error, Notification};
 use crate::domain::job::JobName;
 pub(super) use rows::{micros, time};
 pub(super) use statement::{Row, Statement, Value, run};
@@ -46,8 +46,8 @@ pub(super) trait Connection: Send {
         std::future::ready(Ok(()))
     }
 
-    /// Tells other processes of a change, once it is committed.
-    fn tell(&mut self, _change: Change, _job: &JobName) -> impl Future<Output = Result<(), Error>> + Send {
+    /// Notifies other processes of a change, once it is committed.
+    fn notify(&mut self, _change: Change, _job: &JobName) -> impl Future<Output = Result<(), Error>> + Send {
         std::future::ready(Ok(()))
     }
 
@@ -90,7 +90,7 @@ pub(super) enum Lock {
     Claims,
 }
 
-/// What other processes are told of a job.
+/// What other processes are notified of.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum Change {
     /// It has new events.
@@ -130,7 +130,7 @@ pub(super) trait Database: Send + Sync + 'static {
     fn write<T: Send + 'static>(
         &self,
         size: Size,
-        moves: Moves,
+        intent: WriteIntent,
         operation: Operation<Self::Writing, T>,
     ) -> impl Future<Output = Result<T, Error>> + Send;
 
@@ -160,8 +160,8 @@ pub(super) trait Database: Send + Sync + 'static {
         true
     }
 
-    /// See [`crate::store::Store::hint`].
-    fn heard(&self) -> impl Future<Output = Hint> + Send;
+    /// See [`crate::store::Store::notification`].
+    fn next_notification(&self) -> impl Future<Output = Notification> + Send;
 
     /// Closes every connection.
     fn disconnect(&self) -> impl Future<Output = ()> + Send;
@@ -180,7 +180,7 @@ pub(super) enum Size {
 
 /// What an operation does to the room on the disk.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(super) enum Moves {
+pub(super) enum WriteIntent {
     /// It begins something that writes about so many bytes, now or later: on a full disk nothing new is begun.
     Begins(u64),
     /// It changes a few rows.
@@ -189,7 +189,7 @@ pub(super) enum Moves {
     Ends(u64),
 }
 
-impl Moves {
+impl WriteIntent {
     pub(super) fn bytes(self) -> u64 {
         match self {
             Self::Begins(bytes) | Self::Ends(bytes) => bytes,

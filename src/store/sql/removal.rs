@@ -2,14 +2,14 @@
 
 use std::time::SystemTime;
 
-use super::rows::{micros, standing};
+use super::rows::{locked_job, micros};
 use super::{Connection, Row, Statement, jobs, uploads};
 use crate::domain::job::JobName;
 use crate::store::Error;
 
 /// Removes an ended job; see [`crate::store::Store::delete_job`].
 pub(super) async fn delete<C: Connection>(connection: &mut C, name: &JobName, etag: Option<&str>) -> Result<(), Error> {
-    let job = standing(connection, name).await?;
+    let job = locked_job(connection, name).await?;
     check_etag(connection, name, etag).await?;
     if !job.state.is_terminal() {
         return Err(Error::NotEnded(name.clone(), job.state));

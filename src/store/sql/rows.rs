@@ -121,9 +121,9 @@ pub(super) fn job(row: &impl Row) -> Result<Job, Error> {
     })
 }
 
-/// What the state machine needs to know of a job.
+/// What the state machine needs to know of a job whose row the transaction has locked.
 #[derive(Debug, Clone)]
-pub(super) struct Standing {
+pub(super) struct LockedJob {
     pub id: i64,
     pub name: JobName,
     pub state: JobState,
@@ -136,8 +136,8 @@ pub(super) struct Standing {
     pub observation_count: u32,
 }
 
-impl Standing {
-    /// From a row of `select_standing!`.
+impl LockedJob {
+    /// From a row of `select_locked_job!`.
     pub(super) fn from_row(row: &impl Row) -> Result<Self, Error> {
         Ok(Self {
             id: row.integer("id")?,
@@ -179,8 +179,8 @@ pub(super) fn page<R: Row>(
     Ok((rows, next_page_token))
 }
 
-/// `SELECT` of all that [`Standing::from_row`] reads; the clauses follow.
-macro_rules! select_standing {
+/// `SELECT` of all that [`LockedJob::from_row`] reads; the clauses follow.
+macro_rules! select_locked_job {
     ($clauses:literal) => {
         concat!(
             "SELECT id, tenant, job, state, attempt, lost_attempts, cancel_requested, deadline, last_sequence, ",
@@ -189,21 +189,21 @@ macro_rules! select_standing {
         )
     };
 }
-pub(super) use select_standing;
+pub(super) use select_locked_job;
 
-/// How a job stands; it changes no more until the transaction ends.
-pub(super) async fn standing<C: Connection>(connection: &mut C, name: &JobName) -> Result<Standing, Error> {
-    let select = Statement::new(select_standing!("WHERE tenant = $1 AND job = $2"))
+/// Locks a job: it does not change until the transaction ends.
+pub(super) async fn locked_job<C: Connection>(connection: &mut C, name: &JobName) -> Result<LockedJob, Error> {
+    let select = Statement::new(select_locked_job!("WHERE tenant = $1 AND job = $2"))
         .bind(&name.tenant)
         .bind(&name.job)
         .then(C::FOR_UPDATE);
     let row = connection.optional_row(select).await?;
-    row.as_ref().map_or_else(|| Err(Error::NotFound(name.clone())), Standing::from_row)
+    row.as_ref().map_or_else(|| Err(Error::NotFound(name.clone())), LockedJob::from_row)
 }
 
-/// How a job stands that this lease still holds: what every write of a worker begins with.
-pub(super) async fn held<C: Connection>(connection: &mut C, lease: &Lease) -> Result<Standing, Error> {
-    match standing(connection, &lease.name).await {
+/// Locks a job that this lease still holds: what every write of a worker begins with.
+pub(super) async fn held<C: Connection>(connection: &mut C, lease: &Lease) -> Result<LockedJob, Error> {
+    match locked_job(connection, &lease.name).await {
         Ok(job) if job.state == JobState::Running && job.attempt == lease.attempt => Ok(job),
         Ok(_) | Err(Error::NotFound(_)) => Err(Error::Fenced(lease.clone())),
         Err(error) => Err(error),
@@ -224,7 +224,7 @@ pub(super) fn insert_event(
 }
 
 /// Notes how the latest attempt of a job ended.
-pub(super) fn end_attempt(job: &Standing, end: AttemptEnd, now: SystemTime) -> Statement {
+pub(super) fn end_attempt(job: &LockedJob, end: AttemptEnd, now: SystemTime) -> Statement {
     Statement::new("UPDATE attempts SET end_time = $1, ending = $2 WHERE job_id = $3 AND attempt = $4")
         .bind(micros(now))
         .bind(end.name())
@@ -232,9 +232,9 @@ pub(super) fn end_attempt(job: &Standing, end: AttemptEnd, now: SystemTime) -> S
         .bind(job.attempt)
 }
 
-/// Where a job goes that leaves its state, and what it takes along.
+/// The next state of a job, and what is stored with it.
 #[derive(Debug)]
-pub(super) struct Departure<'a> {
+pub(super) struct Transition<'a> {
     pub next: JobState,
     pub failure: Option<Failure>,
     /// Of a success: it has an event of its own.
@@ -246,8 +246,8 @@ pub(super) struct Departure<'a> {
     pub attempt_end: Option<AttemptEnd>,
 }
 
-impl Departure<'_> {
-    /// One that takes nothing along.
+impl Transition<'_> {
+    /// One with which nothing else is stored.
     pub(super) fn to(next: JobState) -> Self {
         Self { next, failure: None, summary: None, result_sha256: None, progress: None, attempt_end: None }
     }
@@ -255,13 +255,13 @@ impl Departure<'_> {
 
 /// Moves a job out of its state, with the event that says so: to the queue, or to an end. Its lease ends with it.
 /// Returns the job as it stands then.
-pub(super) async fn leave<C: Connection>(
+pub(super) async fn transition<C: Connection>(
     connection: &mut C,
-    job: &Standing,
-    departure: Departure<'_>,
+    job: &LockedJob,
+    transition: Transition<'_>,
     now: SystemTime,
 ) -> Result<Job, Error> {
-    let Departure { next, failure, summary, result_sha256, progress, attempt_end } = departure;
+    let Transition { next, failure, summary, result_sha256, progress, attempt_end } = transition;
     if !job.state.may_become(next) || next == JobState::Running {
         let (from, to) = (job.state.name(), next.name());
         return Err(Error::Corrupt(format!("{} cannot go from {from} to {to} here", job.name)));
@@ -295,9 +295,9 @@ pub(super) async fn leave<C: Connection>(
     if changed.webhook.is_some() && next.is_terminal() {
         connection.execute(webhooks::due(job.id, now)).await?;
     }
-    connection.tell(Change::Events, &job.name).await?;
+    connection.notify(Change::Events, &job.name).await?;
     if next == JobState::Queued {
-        connection.tell(Change::Queued, &job.name).await?;
+        connection.notify(Change::Queued, &job.name).await?;
     }
     Ok(changed)
 }

@@ -6,18 +6,18 @@ use std::time::{Duration, SystemTime};
 
 use futures_util::FutureExt;
 
-use super::{Database, Moves, Size, admin, attempts, claims, jobs, operation, removal, uploads, webhooks};
+use super::{Database, Size, WriteIntent, admin, attempts, claims, jobs, operation, removal, uploads, webhooks};
 use crate::domain::InputName;
 use crate::domain::job::{Job, JobEvent, JobName};
 use crate::domain::progress::Progress;
 use crate::store::record::{
-    CancelReply, Claim, Claims, Created, EncodedResult, Ending, Heartbeat, JobInput, Lease, Load, NewRecord, Outcome,
-    QueueBounds, QueueReport, RetryReply, StoreStats, Swept, WebhookOutcome, WebhookQueue, Work,
+    CancelReply, Claim, Claims, Created, EncodedResult, Ending, Heartbeat, JobInput, JobPayload, Lease, NewRecord,
+    Outcome, QueueBounds, QueueReport, QueueStats, RetryReply, StoreStats, Swept, WebhookOutcome, WebhookQueue,
 };
 use crate::store::upload::{
     BegunUpload, NewInput, NewUpload, PurgedUploads, StoredInput, UploadBounds, UploadLease, UploadStatus,
 };
-use crate::store::{Error, Hint, InputPage, InputQuery, JobPage, JobQuery, Store};
+use crate::store::{Error, InputPage, InputQuery, JobPage, JobQuery, Notification, Store};
 
 /// Waits for an operation as long as the database allows it. One that is broken off changed nothing, or all that it was
 /// to change: a commit may have been on its way.
@@ -51,14 +51,14 @@ const ANY_BYTES: u64 = u64::MAX;
 /// Writes in one transaction, which has the values in brackets to itself: a caller that goes away leaves it whole. They
 /// are cloned for each run of it; what is large is in an [`Arc`].
 macro_rules! writes {
-    ($database:expr, $size:expr, $moves:expr, [$($owned:ident),*], |$connection:ident| $body:expr) => {{
-        let moves: Moves = $moves;
+    ($database:expr, $size:expr, $intent:expr, [$($owned:ident),*], |$connection:ident| $body:expr) => {{
+        let intent: WriteIntent = $intent;
         $(let $owned = $owned.clone();)*
         let run = operation::<D::Writing, _>(move |$connection| {
             $(let $owned = $owned.clone();)*
             async move { $body.await }.boxed()
         });
-        bounded($database, $size, $database.write($size, moves, run)).await
+        bounded($database, $size, $database.write($size, intent, run)).await
     }};
 }
 
@@ -75,7 +75,7 @@ impl<D: Database> Store for D {
             JobInput::Inline(bytes) => bytes.len() as u64,
             JobInput::Uploaded { .. } => 0,
         });
-        writes!(self, Size::Payload, Moves::Begins(stored.sum()), [new, bounds], |connection| jobs::create(
+        writes!(self, Size::Payload, WriteIntent::Begins(stored.sum()), [new, bounds], |connection| jobs::create(
             connection, &new, &bounds, now
         ))
     }
@@ -99,25 +99,25 @@ impl<D: Database> Store for D {
             return Ok(Claims::default());
         }
         let lease_now = self.lease_clock(now);
-        writes!(self, Size::Small, Moves::Begins(0), [claim], |connection| claims::claim(
+        writes!(self, Size::Small, WriteIntent::Begins(0), [claim], |connection| claims::claim(
             connection, &claim, now, lease_now
         ))
     }
 
-    async fn work(&self, name: &JobName) -> Result<Work, Error> {
-        reads!(self, Size::Payload, |connection| jobs::work(connection, name))
+    async fn job_payload(&self, name: &JobName) -> Result<JobPayload, Error> {
+        reads!(self, Size::Payload, |connection| jobs::job_payload(connection, name))
     }
 
     async fn heartbeat(&self, lease: &Lease, now: SystemTime, lease_for: Duration) -> Result<Heartbeat, Error> {
         let expires = self.lease_clock(now) + lease_for;
-        writes!(self, Size::Small, Moves::Ends(0), [lease], |connection| attempts::heartbeat(
+        writes!(self, Size::Small, WriteIntent::Ends(0), [lease], |connection| attempts::heartbeat(
             connection, &lease, expires
         ))
     }
 
     async fn record(&self, lease: &Lease, progress: &Progress, now: SystemTime) -> Result<u64, Error> {
         let progress = *progress;
-        writes!(self, Size::Small, Moves::Little, [lease], |connection| attempts::record(
+        writes!(self, Size::Small, WriteIntent::Little, [lease], |connection| attempts::record(
             connection, &lease, &progress, now
         ))
     }
@@ -127,18 +127,20 @@ impl<D: Database> Store for D {
             Outcome::Succeeded { result, .. } => result.bytes.len() as u64,
             Outcome::Failed(_) | Outcome::Cancelled | Outcome::DeadlineExceeded => 0,
         };
-        writes!(self, Size::Outcome, Moves::Ends(bytes), [lease, ending], |connection| {
+        writes!(self, Size::Outcome, WriteIntent::Ends(bytes), [lease, ending], |connection| {
             attempts::finish(connection, &lease, &ending, now)
         })
     }
 
     async fn release(&self, lease: &Lease, now: SystemTime) -> Result<Job, Error> {
-        writes!(self, Size::Small, Moves::Ends(0), [lease], |connection| attempts::release(connection, &lease, now))
+        writes!(self, Size::Small, WriteIntent::Ends(0), [lease], |connection| attempts::release(
+            connection, &lease, now
+        ))
     }
 
     async fn request_cancel(&self, name: &JobName, etag: Option<&str>, now: SystemTime) -> Result<CancelReply, Error> {
         let etag = etag.map(str::to_owned);
-        writes!(self, Size::Small, Moves::Ends(0), [name, etag], |connection| {
+        writes!(self, Size::Small, WriteIntent::Ends(0), [name, etag], |connection| {
             attempts::request_cancel(connection, &name, etag.as_deref(), now)
         })
     }
@@ -151,20 +153,20 @@ impl<D: Database> Store for D {
         now: SystemTime,
     ) -> Result<RetryReply, Error> {
         let etag = etag.map(str::to_owned);
-        writes!(self, Size::Small, Moves::Begins(0), [name, etag, bounds], |connection| {
+        writes!(self, Size::Small, WriteIntent::Begins(0), [name, etag, bounds], |connection| {
             admin::retry(connection, &name, etag.as_deref(), &bounds, now)
         })
     }
 
     async fn set_priority(&self, name: &JobName, etag: Option<&str>, priority: i32) -> Result<Job, Error> {
         let etag = etag.map(str::to_owned);
-        writes!(self, Size::Small, Moves::Little, [name, etag], |connection| {
+        writes!(self, Size::Small, WriteIntent::Little, [name, etag], |connection| {
             admin::set_priority(connection, &name, etag.as_deref(), priority)
         })
     }
 
     async fn set_paused(&self, paused: bool, now: SystemTime) -> Result<(), Error> {
-        writes!(self, Size::Small, Moves::Ends(0), [], |connection| admin::set_paused(connection, paused, now))
+        writes!(self, Size::Small, WriteIntent::Ends(0), [], |connection| admin::set_paused(connection, paused, now))
     }
 
     async fn queue(&self, tenants: u32) -> Result<QueueReport, Error> {
@@ -173,12 +175,12 @@ impl<D: Database> Store for D {
     }
 
     async fn detach(&self, name: &JobName, created: SystemTime) -> Result<Job, Error> {
-        writes!(self, Size::Small, Moves::Ends(0), [name], |connection| jobs::detach(connection, &name, created))
+        writes!(self, Size::Small, WriteIntent::Ends(0), [name], |connection| jobs::detach(connection, &name, created))
     }
 
     async fn delete_job(&self, name: &JobName, etag: Option<&str>) -> Result<(), Error> {
         let etag = etag.map(str::to_owned);
-        writes!(self, Size::Payload, Moves::Ends(ANY_BYTES), [name, etag], |connection| {
+        writes!(self, Size::Payload, WriteIntent::Ends(ANY_BYTES), [name, etag], |connection| {
             removal::delete(connection, &name, etag.as_deref())
         })
     }
@@ -187,7 +189,7 @@ impl<D: Database> Store for D {
         if !reads!(self, Size::Small, |connection| removal::needs_purge(connection, ended_by))? {
             return Ok(0);
         }
-        writes!(self, Size::Payload, Moves::Ends(ANY_BYTES), [], |connection| removal::purge(
+        writes!(self, Size::Payload, WriteIntent::Ends(ANY_BYTES), [], |connection| removal::purge(
             connection, ended_by, limit
         ))
     }
@@ -199,7 +201,7 @@ impl<D: Database> Store for D {
     async fn recover(&self, now: SystemTime, max_attempts: u32) -> Result<Vec<Job>, Error> {
         // Where no other process can be at work, every lease is a dead one's.
         let expired_at = D::SHARED.then(|| self.lease_clock(now));
-        writes!(self, Size::Small, Moves::Ends(0), [], |connection| attempts::take_back(
+        writes!(self, Size::Small, WriteIntent::Ends(0), [], |connection| attempts::take_back(
             connection,
             expired_at,
             now,
@@ -214,7 +216,7 @@ impl<D: Database> Store for D {
         if !reads!(self, Size::Small, |connection| attempts::needs_sweep(connection, expired_at, now))? {
             return Ok(Swept::default());
         }
-        writes!(self, Size::Small, Moves::Ends(0), [], |connection| async {
+        writes!(self, Size::Small, WriteIntent::Ends(0), [], |connection| async {
             let lost = attempts::take_back(connection, Some(expired_at), now, max_attempts).await?;
             let expired = attempts::expire_queued(connection, now).await?;
             Ok::<_, Error>(Swept { lost, expired })
@@ -232,7 +234,9 @@ impl<D: Database> Store for D {
         now: SystemTime,
     ) -> Result<BegunUpload, Error> {
         let bounds = *bounds;
-        writes!(self, Size::Small, Moves::Begins(0), [new], |connection| uploads::begin(connection, &new, &bounds, now))
+        writes!(self, Size::Small, WriteIntent::Begins(0), [new], |connection| uploads::begin(
+            connection, &new, &bounds, now
+        ))
     }
 
     async fn append_upload(
@@ -243,7 +247,7 @@ impl<D: Database> Store for D {
         now: SystemTime,
     ) -> Result<(), Error> {
         let data: Arc<[u8]> = data.into();
-        writes!(self, Size::Payload, Moves::Begins(data.len() as u64), [lease, data], |connection| {
+        writes!(self, Size::Payload, WriteIntent::Begins(data.len() as u64), [lease, data], |connection| {
             uploads::append(connection, &lease, at_byte, &data, now)
         })
     }
@@ -258,14 +262,14 @@ impl<D: Database> Store for D {
         new: &Arc<NewInput>,
         now: SystemTime,
     ) -> Result<StoredInput, Error> {
-        let moves = Moves::Begins(new.payload.len() as u64);
-        writes!(self, Size::Payload, moves, [lease, new], |connection| {
+        let intent = WriteIntent::Begins(new.payload.len() as u64);
+        writes!(self, Size::Payload, intent, [lease, new], |connection| {
             uploads::finish(connection, &lease, &new, now)
         })
     }
 
     async fn give_up_upload(&self, lease: &UploadLease) -> Result<(), Error> {
-        writes!(self, Size::Small, Moves::Ends(0), [lease], |connection| uploads::give_up(connection, &lease))
+        writes!(self, Size::Small, WriteIntent::Ends(0), [lease], |connection| uploads::give_up(connection, &lease))
     }
 
     async fn upload(&self, name: &InputName) -> Result<UploadStatus, Error> {
@@ -281,7 +285,9 @@ impl<D: Database> Store for D {
     }
 
     async fn delete_input(&self, name: &InputName) -> Result<(), Error> {
-        writes!(self, Size::Payload, Moves::Ends(ANY_BYTES), [name], |connection| uploads::delete(connection, &name))
+        writes!(self, Size::Payload, WriteIntent::Ends(ANY_BYTES), [name], |connection| uploads::delete(
+            connection, &name
+        ))
     }
 
     async fn purge_uploads(
@@ -292,13 +298,13 @@ impl<D: Database> Store for D {
         if !reads!(self, Size::Small, |connection| uploads::needs_purge(connection, abandoned_by, unused_since))? {
             return Ok(PurgedUploads::default());
         }
-        writes!(self, Size::Payload, Moves::Ends(ANY_BYTES), [], |connection| {
+        writes!(self, Size::Payload, WriteIntent::Ends(ANY_BYTES), [], |connection| {
             uploads::purge(connection, abandoned_by, unused_since)
         })
     }
 
-    async fn load(&self) -> Result<Load, Error> {
-        reads!(self, Size::Small, |connection| jobs::load(connection))
+    async fn queue_stats(&self) -> Result<QueueStats, Error> {
+        reads!(self, Size::Small, |connection| jobs::queue_stats(connection))
     }
 
     async fn webhook_queue(&self, now: SystemTime) -> Result<WebhookQueue, Error> {
@@ -314,7 +320,7 @@ impl<D: Database> Store for D {
     ) -> Result<Option<Job>, Error> {
         let due_by = self.lease_clock(now);
         let passed: Arc<[String]> = passed.into();
-        writes!(self, Size::Small, Moves::Begins(0), [passed], |connection| webhooks::claim(
+        writes!(self, Size::Small, WriteIntent::Begins(0), [passed], |connection| webhooks::claim(
             connection,
             &passed,
             due_by,
@@ -325,7 +331,7 @@ impl<D: Database> Store for D {
     async fn settle_webhook(&self, claimed: &Job, outcome: &WebhookOutcome, now: SystemTime) -> Result<bool, Error> {
         let now = self.lease_clock(now);
         let claimed = Arc::new(claimed.clone());
-        writes!(self, Size::Small, Moves::Ends(0), [claimed, outcome], |connection| webhooks::settle(
+        writes!(self, Size::Small, WriteIntent::Ends(0), [claimed, outcome], |connection| webhooks::settle(
             connection, &claimed, &outcome, now
         ))
     }
@@ -344,8 +350,8 @@ impl<D: Database> Store for D {
         Database::has_room(self)
     }
 
-    async fn hint(&self) -> Hint {
-        self.heard().await
+    async fn notification(&self) -> Notification {
+        self.next_notification().await
     }
 
     async fn close(&self) {

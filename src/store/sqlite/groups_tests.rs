@@ -42,7 +42,7 @@ async fn commits(store: &Sqlite) -> Count {
         }
         .boxed()
     });
-    store.writer.write(Moves::Little, hook).await.expect("hooked");
+    store.writer.write(WriteIntent::Little, hook).await.expect("hooked");
     commits
 }
 
@@ -85,7 +85,7 @@ async fn one_that_breaks_the_transaction_of_all_costs_only_itself() {
     .await;
     let (go, held) = fixture.hold().await;
     let runs = Count::default();
-    let counted = fixture.writer.write(Moves::Little, counting(&runs));
+    let counted = fixture.writer.write(WriteIntent::Little, counting(&runs));
     let creations = ["a", "b", "bad", "c"].map(|name| {
         let bytes = if name == "bad" { 13 } else { 14 };
         let new = NewRecord { input: vec![1; bytes].into(), ..contract::record(name) };
@@ -121,9 +121,9 @@ async fn what_is_large_is_committed_by_itself_and_costs_the_others_nothing() {
     let (first, second) = (Count::default(), Count::default());
     let calls = async {
         tokio::join!(
-            fixture.writer.write(Moves::Little, counting(&first)),
+            fixture.writer.write(WriteIntent::Little, counting(&first)),
             large("large", 1),
-            fixture.writer.write(Moves::Little, counting(&second)),
+            fixture.writer.write(WriteIntent::Little, counting(&second)),
             large("broken", 2),
         )
     };
@@ -141,7 +141,7 @@ async fn an_operation_that_panics_costs_only_itself() {
     let called = sql::operation(|_: &mut WriteConnection| panic!("in the call"));
     let awaited = sql::operation(|_: &mut WriteConnection| async { panic!("in what it awaits") }.boxed());
     for operation in [called, awaited] {
-        let outcome: Result<(), Error> = fixture.writer.write(Moves::Little, operation).await;
+        let outcome: Result<(), Error> = fixture.writer.write(WriteIntent::Little, operation).await;
         assert!(matches!(outcome, Err(Error::Corrupt(_))), "{outcome:?}");
     }
     fixture.create_job(contract::record("a"), &contract::ROOM, contract::time(1)).await.expect("goes on");
@@ -167,7 +167,7 @@ async fn what_is_told_not_to_have_had_its_turn_is_not_run() {
     let mut impatient = fixture.writer.clone();
     impatient.patience = Duration::from_millis(1);
     let runs = Count::default();
-    let outcome = impatient.write(Moves::Little, counting(&runs)).await;
+    let outcome = impatient.write(WriteIntent::Little, counting(&runs)).await;
     assert!(matches!(&outcome, Err(Error::Unavailable(text)) if text.contains("no turn")), "{outcome:?}");
     drop(go);
     held.await.expect("no panic").expect("held");

@@ -4,11 +4,11 @@
 //! those that wait together are committed together. Reads have their own connections and, thanks to the write-ahead
 //! log, never wait for the writer.
 
+mod ballast;
 mod connection;
 #[cfg(test)]
 mod groups_tests;
 mod log;
-mod reserve;
 #[cfg(test)]
 mod tests;
 mod vacuum;
@@ -25,12 +25,12 @@ use sqlx::sqlite::{
 };
 
 use super::clock::LeaseClock;
-use super::sql::{self, Connection, Database, Moves, Operation, Size, Statement, Step};
-use super::{Clock, Error, Hint};
+use super::sql::{self, Connection, Database, Operation, Size, Statement, Step, WriteIntent};
+use super::{Clock, Error, Notification};
+use ballast::{Ballast, SpaceFlag};
 pub(super) use connection::WriteConnection;
 #[cfg(test)]
 pub(super) use connection::WrittenRow;
-use reserve::{Reserve, Room};
 use vacuum::{VACUUM, VACUUM_BYTES, VACUUMS};
 use writer::Writer;
 
@@ -72,7 +72,7 @@ const OWN_TABLES: &str = "SELECT COUNT(*) FROM sqlite_schema WHERE name IN ('_sq
 #[derive(Debug)]
 pub struct Sqlite {
     writer: Writer,
-    has_room: Room,
+    has_room: SpaceFlag,
     clock: LeaseClock,
     readers: SqlitePool,
     /// The database and its write-ahead log.
@@ -98,17 +98,17 @@ impl Sqlite {
             create(directory, &database).await?;
         }
         let options = options(&database);
-        let mut reserve = Reserve::of(directory);
+        let mut ballast = Ballast::of(directory);
         let connection = match bring_up_to_date(&options, &database).await {
             // To open it is to write, too: a log and its index. Where these cannot be made, not every system says why.
-            Err(Error::NoSpace(_) | Error::Unavailable(_)) if reserve.give_up() => {
+            Err(Error::NoSpace(_) | Error::Unavailable(_)) if ballast.give_up() => {
                 bring_up_to_date(&options, &database).await?
             }
             opened => opened?,
         };
-        let has_room = reserve.room();
+        let has_room = ballast.space_flag();
         let files = [database.clone(), log_of(&database)];
-        let writer = Writer::start(connection, database, reserve, group_time)?;
+        let writer = Writer::start(connection, database, ballast, group_time)?;
         let readers = readers().connect_with(options.pragma("query_only", "1")).await?;
         let clock = LeaseClock::new(Clock::default());
         Ok(Self { writer, has_room, clock, readers, files, _lock: lock })
@@ -120,7 +120,7 @@ impl Sqlite {
         let run = sql::operation(move |connection: &mut WriteConnection| {
             Box::pin(async move { Ok(connection.inner().execute_batch(statements)?) })
         });
-        self.writer.write(Moves::Little, run).await.expect("valid statements");
+        self.writer.write(WriteIntent::Little, run).await.expect("valid statements");
     }
 }
 
@@ -259,10 +259,10 @@ impl Database for Sqlite {
     async fn write<T: Send + 'static>(
         &self,
         _size: Size,
-        moves: Moves,
+        intent: WriteIntent,
         operation: Operation<WriteConnection, T>,
     ) -> Result<T, Error> {
-        self.writer.write(moves, operation).await
+        self.writer.write(intent, operation).await
     }
 
     fn bound(&self, _size: Size) -> Option<Duration> {
@@ -290,16 +290,16 @@ impl Database for Sqlite {
             if !self.writer.vacuum_pays().await? {
                 break;
             }
-            self.writer.run(Moves::Ends(VACUUM_BYTES), VACUUM).await?;
+            self.writer.run(WriteIntent::Ends(VACUUM_BYTES), VACUUM).await?;
         }
         self.writer.shorten().await
     }
 
     fn has_room(&self) -> bool {
-        self.has_room.is_there()
+        self.has_room.is_set()
     }
 
-    async fn heard(&self) -> Hint {
+    async fn next_notification(&self) -> Notification {
         std::future::pending().await
     }
 

@@ -66,14 +66,14 @@ impl Sqlite {
             .boxed()
         });
         let writer = self.writer.clone();
-        let held = tokio::spawn(async move { writer.write(Moves::Little, wait).await });
+        let held = tokio::spawn(async move { writer.write(WriteIntent::Little, wait).await });
         begun.await.expect("it begins");
         (go, held)
     }
 
     /// What a pragma says on the connection that writes.
     async fn on_writer<T>(&self, pragma: &'static str, read: fn(&connection::WrittenRow) -> Result<T, Error>) -> T {
-        let rows = self.writer.run(Moves::Little, pragma).await.expect("an answer");
+        let rows = self.writer.run(WriteIntent::Little, pragma).await.expect("an answer");
         read(&rows[0]).expect("a value")
     }
 }

@@ -2,10 +2,10 @@
 //!
 //! A commit costs a sync of the disk, whatever is in it. Operations that arrive while one is under way are the next
 //! group: each is a transaction of its own to its caller, who hears of it once the group's commit is on the disk. What
-//! is large is a group of its own. Here is the handle that callers have; `pending` is an operation on its way, `desk`
-//! what the thread does with it.
+//! is large is a group of its own. Here is the handle that callers have; `pending` is an operation on its way,
+//! `commit_batcher` what the thread does with it.
 
-mod desk;
+mod commit_batcher;
 mod pending;
 
 use std::path::PathBuf;
@@ -16,12 +16,12 @@ use futures_util::FutureExt;
 use tokio::sync::{mpsc, oneshot};
 use tokio::time::timeout;
 
-use self::desk::Desk;
+use self::commit_batcher::CommitBatcher;
 use self::pending::{Pending, Waiting};
+use super::ballast::Ballast;
 use super::connection::{WriteConnection, WrittenRow};
-use super::reserve::Reserve;
 use crate::store::Error;
-use crate::store::sql::{self, Moves, Operation, Statement};
+use crate::store::sql::{self, Operation, Statement, WriteIntent};
 
 /// How long an operation waits for its turn; behind a queue of writes this long, the disk has failed.
 const PATIENCE: Duration = Duration::from_secs(60);
@@ -52,14 +52,14 @@ enum Message {
 
 impl Writer {
     /// Starts the thread on a connection to `database`, which it opens anew when that is of no more use. On a full disk
-    /// `reserve` is for what makes room. A group goes on taking operations for `group_time`.
+    /// `ballast` is for what makes room. A group goes on taking operations for `group_time`.
     ///
     /// # Errors
     /// [`Error::Unavailable`] where the system has no thread to give.
     pub(super) fn start(
         connection: WriteConnection,
         database: PathBuf,
-        reserve: Reserve,
+        ballast: Ballast,
         group_time: Duration,
     ) -> Result<Self, Error> {
         let (inbox, messages) = mpsc::unbounded_channel();
@@ -67,8 +67,8 @@ impl Writer {
         // A runtime of its own: what is awaited here is the next message and, within an operation, nothing but in
         // tests.
         let runtime = tokio::runtime::Builder::new_current_thread().build().map_err(failed)?;
-        let desk = Desk::new(connection, database, reserve, messages, group_time);
-        let work = move || runtime.block_on(desk.serve());
+        let commit_batcher = CommitBatcher::new(connection, database, ballast, messages, group_time);
+        let work = move || runtime.block_on(commit_batcher.serve());
         thread::Builder::new().name("store-writer".into()).spawn(work).map_err(failed)?;
         Ok(Self { inbox, patience: PATIENCE })
     }
@@ -76,10 +76,10 @@ impl Writer {
     /// Runs an operation and answers once what it wrote is on the disk.
     pub(super) async fn write<T: Send + 'static>(
         &self,
-        moves: Moves,
+        intent: WriteIntent,
         operation: Operation<WriteConnection, T>,
     ) -> Result<T, Error> {
-        let (pending, turn, mut answer) = Pending::new(moves, operation);
+        let (pending, turn, mut answer) = Pending::new(intent, operation);
         let closed = || Error::Unavailable("the store is closed".into());
         self.inbox.send(Message::Write(Box::new(pending))).map_err(|_| closed())?;
         loop {
@@ -95,11 +95,11 @@ impl Writer {
     }
 
     /// Runs one statement without parameters and returns its rows.
-    pub(super) async fn run(&self, moves: Moves, statement: &'static str) -> Result<Vec<WrittenRow>, Error> {
+    pub(super) async fn run(&self, intent: WriteIntent, statement: &'static str) -> Result<Vec<WrittenRow>, Error> {
         let run = sql::operation(move |connection: &mut WriteConnection| {
             async move { sql::Connection::rows(connection, Statement::new(statement)).await }.boxed()
         });
-        self.write(moves, run).await
+        self.write(intent, run).await
     }
 
     /// Whether to give free pages back is worth the room that it takes.

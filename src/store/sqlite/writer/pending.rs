@@ -10,18 +10,18 @@ use tokio::sync::oneshot;
 
 use super::{LARGE_BYTES, WriteConnection};
 use crate::store::Error;
-use crate::store::sql::{Moves, Operation};
+use crate::store::sql::{Operation, WriteIntent};
 
 /// An operation that waits for its turn, whatever it answers.
 pub(super) trait Waiting: Send {
     /// Marks it as begun; `false` where its caller is gone, and nobody wants it any more.
     fn begins(&self) -> bool;
 
-    fn moves(&self) -> Moves;
+    fn intent(&self) -> WriteIntent;
 
     /// Whether it is to have a commit of its own.
     fn is_large(&self) -> bool {
-        self.moves().bytes() > LARGE_BYTES
+        self.intent().bytes() > LARGE_BYTES
     }
 
     /// Runs it within the transaction and keeps its answer. It may be run again where the transaction came to nothing.
@@ -57,7 +57,7 @@ impl Turn {
 
 pub(super) struct Pending<T> {
     operation: Operation<WriteConnection, T>,
-    moves: Moves,
+    intent: WriteIntent,
     value: Option<T>,
     turn: Arc<Turn>,
     reply: oneshot::Sender<Result<T, Error>>,
@@ -66,12 +66,12 @@ pub(super) struct Pending<T> {
 impl<T> Pending<T> {
     /// With the turn that its caller may give up, and where its answer comes.
     pub(super) fn new(
-        moves: Moves,
+        intent: WriteIntent,
         operation: Operation<WriteConnection, T>,
     ) -> (Self, Arc<Turn>, oneshot::Receiver<Result<T, Error>>) {
         let turn = Arc::new(Turn::default());
         let (reply, answer) = oneshot::channel();
-        (Self { operation, moves, value: None, turn: turn.clone(), reply }, turn, answer)
+        (Self { operation, intent, value: None, turn: turn.clone(), reply }, turn, answer)
     }
 }
 
@@ -80,8 +80,8 @@ impl<T: Send + 'static> Waiting for Pending<T> {
         self.turn.begin() && !self.reply.is_closed()
     }
 
-    fn moves(&self) -> Moves {
-        self.moves
+    fn intent(&self) -> WriteIntent {
+        self.intent
     }
 
     fn run<'c>(&'c mut self, connection: &'c mut WriteConnection) -> BoxFuture<'c, Result<(), Error>> {

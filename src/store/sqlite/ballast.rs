@@ -1,9 +1,8 @@
-//! Room that is kept for a full disk: a file of nothing, given up so that what was begun ends and what frees more is
-//! written.
+//! Ballast for a full disk: a file of zeros, given up so that what was begun ends and what frees more is written.
 //!
 //! To cancel and to delete is to write, too. On a disk without a byte left an operator could do neither, jobs would
 //! lose their leases with what they found, and a server that was restarted could not even open its store. Until there
-//! is a reserve again nothing new is begun: no job or upload is taken in, none that waits is claimed.
+//! is ballast again nothing new is begun: no job or upload is taken in, none that waits is claimed.
 
 use std::fs::File;
 use std::io::{self, Write};
@@ -14,55 +13,55 @@ use std::time::{Duration, Instant};
 
 use crate::store::Error;
 
-/// The reserve within the data directory.
-const RESERVE_FILE: &str = "scpsfm.reserve";
+/// The ballast within the data directory.
+const BALLAST_FILE: &str = "scpsfm.reserve";
 
 /// What is kept, in bytes: the log as long as it may grow before it is written back (1,000 pages, 4 MiB), the database
 /// grown by as much, one [`VACUUM`](super::vacuum::VACUUM) and its pages in the log. The results of the jobs that run
 /// seldom have more.
-pub(super) const RESERVE_BYTES: u64 = 16 << 20;
+pub(super) const BALLAST_BYTES: u64 = 16 << 20;
 
 /// What must be free beside it, in bytes, where it is made: as long as the log may grow, so that what is begun again
 /// has room, and it is not given up again at once.
 const BESIDE_BYTES: u64 = 4 << 20;
 
-/// Between two attempts to have the reserve back: writers wait for each.
+/// Between two attempts to restore the ballast: writers wait for each.
 pub(super) const RETRY: Duration = Duration::from_secs(1);
 
 /// The file of a data directory.
 #[derive(Debug)]
-pub(super) struct Reserve {
+pub(super) struct Ballast {
     path: PathBuf,
     is_whole: bool,
     /// When it was last tried to make it, and why there is none.
     tried: Option<(Instant, String)>,
     /// When its room was last given to others.
     given_up: Option<Instant>,
-    has_room: Room,
+    has_room: SpaceFlag,
 }
 
 /// Whether there is room to begin something, for those who ask from other threads.
 #[derive(Debug, Clone)]
-pub(super) struct Room(Arc<AtomicBool>);
+pub(super) struct SpaceFlag(Arc<AtomicBool>);
 
-impl Room {
-    pub(super) fn is_there(&self) -> bool {
+impl SpaceFlag {
+    pub(super) fn is_set(&self) -> bool {
         self.0.load(Ordering::Relaxed)
     }
 }
 
-impl Reserve {
+impl Ballast {
     /// The one of this directory, made where there is none.
     pub(super) fn of(directory: &Path) -> Self {
-        let path = directory.join(RESERVE_FILE);
-        let is_whole = std::fs::metadata(&path).is_ok_and(|file| file.len() == RESERVE_BYTES);
-        let mut reserve =
-            Self { path, is_whole, tried: None, given_up: None, has_room: Room(Arc::new(AtomicBool::new(true))) };
-        reserve.restore();
-        reserve
+        let path = directory.join(BALLAST_FILE);
+        let is_whole = std::fs::metadata(&path).is_ok_and(|file| file.len() == BALLAST_BYTES);
+        let mut ballast =
+            Self { path, is_whole, tried: None, given_up: None, has_room: SpaceFlag(Arc::new(AtomicBool::new(true))) };
+        ballast.restore();
+        ballast
     }
 
-    pub(super) fn room(&self) -> Room {
+    pub(super) fn space_flag(&self) -> SpaceFlag {
         self.has_room.clone()
     }
 
@@ -81,7 +80,7 @@ impl Reserve {
         self.tried.as_ref().is_some_and(|(at, _)| at.elapsed() < RETRY)
     }
 
-    /// Whether there is a reserve, made anew where it was given up and there is room again.
+    /// Whether there is ballast, made anew where it was given up and there is room again.
     pub(super) fn restore(&mut self) -> bool {
         if self.is_whole || self.tried_lately() {
             return self.is_whole;
@@ -126,14 +125,14 @@ impl Reserve {
     pub(super) fn refusal(&self) -> Error {
         let cause = self.tried.as_ref().map_or("", |(_, error)| error);
         let path = self.path.display();
-        Error::NoSpace(format!("{} MiB cannot be kept in {path} for a full disk: {cause}", RESERVE_BYTES >> 20))
+        Error::NoSpace(format!("{} MiB cannot be kept in {path} for a full disk: {cause}", BALLAST_BYTES >> 20))
     }
 
     /// Under its own name only once it is whole, so that its length tells.
     fn make(&self) -> io::Result<()> {
         let draft = self.path.with_extension("reserve.new");
-        let made = allocate(&draft, RESERVE_BYTES + BESIDE_BYTES)
-            .and_then(|file| file.set_len(RESERVE_BYTES))
+        let made = allocate(&draft, BALLAST_BYTES + BESIDE_BYTES)
+            .and_then(|file| file.set_len(BALLAST_BYTES))
             .and_then(|()| std::fs::rename(&draft, &self.path));
         if made.is_err() {
             let _ = std::fs::remove_file(&draft);
@@ -165,31 +164,31 @@ fn allocate(path: &Path, bytes: u64) -> io::Result<File> {
 mod tests {
     use super::*;
 
-    fn length(reserve: &Reserve) -> Option<u64> {
-        std::fs::metadata(&reserve.path).ok().map(|file| file.len())
+    fn length(ballast: &Ballast) -> Option<u64> {
+        std::fs::metadata(&ballast.path).ok().map(|file| file.len())
     }
 
     #[test]
     fn what_was_given_up_is_made_again_once_there_is_room() {
         let directory = tempfile::tempdir().expect("a temporary directory");
-        let mut reserve = Reserve::of(directory.path());
-        assert!(reserve.is_whole() && length(&reserve) == Some(RESERVE_BYTES));
-        assert!(reserve.give_up() && !reserve.is_whole() && length(&reserve).is_none());
-        assert!(!reserve.give_up(), "it was given already");
+        let mut ballast = Ballast::of(directory.path());
+        assert!(ballast.is_whole() && length(&ballast) == Some(BALLAST_BYTES));
+        assert!(ballast.give_up() && !ballast.is_whole() && length(&ballast).is_none());
+        assert!(!ballast.give_up(), "it was given already");
         // Where its draft should stand is no room.
-        let draft = reserve.path.with_extension("reserve.new");
+        let draft = ballast.path.with_extension("reserve.new");
         std::fs::create_dir(&draft).expect("a folder");
-        assert!(reserve.room().is_there(), "it may yet be had back");
-        assert!(!reserve.is_due(), "it is for whoever it was given up for");
-        reserve.given_up = None;
-        assert!(reserve.is_due() && !reserve.restore() && !reserve.is_whole() && !reserve.room().is_there());
+        assert!(ballast.space_flag().is_set(), "it may yet be had back");
+        assert!(!ballast.is_due(), "it is for whoever it was given up for");
+        ballast.given_up = None;
+        assert!(ballast.is_due() && !ballast.restore() && !ballast.is_whole() && !ballast.space_flag().is_set());
         std::fs::remove_dir(&draft).expect("removed");
-        assert!(!reserve.is_due() && !reserve.restore(), "not tried again at once");
-        reserve.tried = None;
+        assert!(!ballast.is_due() && !ballast.restore(), "not tried again at once");
+        ballast.tried = None;
         assert!(
-            reserve.restore()
-                && reserve.room().is_there()
-                && length(&reserve) == Some(RESERVE_BYTES)
+            ballast.restore()
+                && ballast.space_flag().is_set()
+                && length(&ballast) == Some(BALLAST_BYTES)
                 && !draft.exists()
         );
     }
@@ -197,8 +196,8 @@ mod tests {
     #[test]
     fn one_that_was_cut_off_is_made_whole() {
         let directory = tempfile::tempdir().expect("a temporary directory");
-        std::fs::write(directory.path().join(RESERVE_FILE), [1; 1_000]).expect("written");
-        let reserve = Reserve::of(directory.path());
-        assert!(reserve.is_whole() && length(&reserve) == Some(RESERVE_BYTES));
+        std::fs::write(directory.path().join(BALLAST_FILE), [1; 1_000]).expect("written");
+        let ballast = Ballast::of(directory.path());
+        assert!(ballast.is_whole() && length(&ballast) == Some(BALLAST_BYTES));
     }
 }

@@ -1,36 +1,36 @@
-//! Heeding what other servers on the same store tell: a hint says where to look, never what is there.
+//! Handles the notifications of other servers on the same store: one says where to look, never what is there.
 
 use std::sync::Arc;
 
 use super::{Inner, Phase, locked};
 use crate::domain::StopReason;
 use crate::domain::job::JobName;
-use crate::store::Hint;
+use crate::store::Notification;
 
-/// Passes hints on to whoever waits for what they tell of, until the engine is closed.
+/// Passes notifications on to whoever waits for such a change, until the engine is closed.
 pub(super) async fn run(inner: Arc<Inner>) {
     let mut phase = inner.phase.subscribe();
     while *phase.borrow_and_update() != Phase::Closed {
         tokio::select! {
             biased;
             _ = phase.changed() => {}
-            hint = inner.store.hint() => inner.heed(hint).await,
+            notification = inner.store.notification() => inner.handle(notification).await,
         }
     }
 }
 
 impl Inner {
-    async fn heed(&self, hint: Hint) {
-        match hint {
-            Hint::Events(job) => self.hub.wake(&job),
-            Hint::Queued => {
+    async fn handle(&self, notification: Notification) {
+        match notification {
+            Notification::Events(job) => self.notifier.wake(&job),
+            Notification::Queued => {
                 self.work_waits();
                 self.queue_changed();
             }
-            Hint::Cancel(job) => self.look_for_cancel(&job).await,
+            Notification::Cancel(job) => self.look_for_cancel(&job).await,
             // Watchers and slots look by themselves within their polls; this only makes it sooner.
-            Hint::Missed => {
-                self.hub.wake_all();
+            Notification::Missed => {
+                self.notifier.wake_all();
                 self.work_waits();
             }
         }

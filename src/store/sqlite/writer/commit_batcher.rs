@@ -8,10 +8,10 @@ use tokio::sync::mpsc;
 use super::Message;
 use super::pending::Waiting;
 use crate::store::Error;
-use crate::store::sql::Moves;
+use crate::store::sql::WriteIntent;
+use crate::store::sqlite::ballast::{BALLAST_BYTES, Ballast, RETRY};
 use crate::store::sqlite::connection::WriteConnection;
 use crate::store::sqlite::log::{LONG_PAGES, Log};
-use crate::store::sqlite::reserve::{RESERVE_BYTES, RETRY, Reserve};
 use crate::store::sqlite::vacuum::VACUUM_BYTES;
 use crate::telemetry::metrics;
 
@@ -19,12 +19,12 @@ use crate::telemetry::metrics;
 const BEGIN: &str = "BEGIN IMMEDIATE";
 
 /// What the thread has.
-pub(super) struct Desk {
+pub(super) struct CommitBatcher {
     /// `None`: the last one was of no more use.
     connection: Option<WriteConnection>,
     database: PathBuf,
-    reserve: Reserve,
-    /// When the reserve was last given up so that the log could be cut. For a while that is not tried again: it may
+    ballast: Ballast,
+    /// When the ballast was last given up so that the log could be cut. For a while that is not tried again: it may
     /// have won nothing.
     gave_for_log: Option<Instant>,
     messages: mpsc::UnboundedReceiver<Message>,
@@ -33,17 +33,17 @@ pub(super) struct Desk {
 
 /// An operation of a group and what it came to: answered with that once the group is committed, also where it was
 /// refused, as it may have seen what the others had written.
-type Ran = (Box<dyn Waiting>, Result<(), Error>);
+type Executed = (Box<dyn Waiting>, Result<(), Error>);
 
-impl Desk {
+impl CommitBatcher {
     pub(super) fn new(
         connection: WriteConnection,
         database: PathBuf,
-        reserve: Reserve,
+        ballast: Ballast,
         messages: mpsc::UnboundedReceiver<Message>,
         group_time: Duration,
     ) -> Self {
-        Self { connection: Some(connection), database, reserve, gave_for_log: None, messages, group_time }
+        Self { connection: Some(connection), database, ballast, gave_for_log: None, messages, group_time }
     }
 
     /// Works until every handle is gone, or it is told to close.
@@ -83,27 +83,27 @@ impl Desk {
     /// Runs operations until none waits, commits them together and answers them; a large one alone. Returns what it was
     /// handed and is no part of the group: a large operation, or what is none.
     async fn group(&mut self, first: Box<dyn Waiting>) -> Option<Message> {
-        // Here, and not where one is run again, for which the reserve was given up.
-        if self.reserve.is_due() {
+        // Here, and not where one is run again, for which the ballast was given up.
+        if self.ballast.is_due() {
             self.cut_log();
-            self.reserve.restore();
+            self.ballast.restore();
         }
         let begun = Instant::now();
         let alone = first.is_large();
         let mut left_over = None;
-        let mut group: Vec<Ran> = Vec::new();
+        let mut group: Vec<Executed> = Vec::new();
         let mut next = Some(first);
         while let Some(mut operation) = next.take() {
             if operation.begins() {
-                let ran = match group.is_empty() {
+                let result = match group.is_empty() {
                     true => self.open(operation.as_mut()).await.map(Ok),
                     false => self.join(operation.as_mut()).await,
                 };
-                match ran {
+                match result {
                     Ok(outcome) => group.push((operation, outcome)),
                     // Nothing of anyone else's is in the transaction, or has been seen in it.
                     Err(error) if group.is_empty() => {
-                        let helped = self.with_reserve(operation.as_mut(), error).await;
+                        let helped = self.with_ballast(operation.as_mut(), error).await;
                         operation.answer(helped);
                     }
                     Err(error) => {
@@ -129,14 +129,14 @@ impl Desk {
 
     /// Begins a transaction with this operation; without one where it is refused.
     async fn open(&mut self, operation: &mut dyn Waiting) -> Result<(), Error> {
-        let mut ran = self.control(BEGIN);
-        if ran.is_ok() {
-            ran = self.run(operation).await;
+        let mut result = self.control(BEGIN);
+        if result.is_ok() {
+            result = self.run(operation).await;
         }
-        if ran.is_err() {
+        if result.is_err() {
             self.roll_back();
         }
-        ran
+        result
     }
 
     /// Runs an operation in the transaction of others, which stand whatever becomes of it. An error says that the
@@ -157,7 +157,7 @@ impl Desk {
     }
 
     /// Makes a group durable and answers it.
-    async fn commit(&mut self, group: Vec<Ran>) {
+    async fn commit(&mut self, group: Vec<Executed>) {
         if group.is_empty() {
             return;
         }
@@ -170,12 +170,12 @@ impl Desk {
 
     /// Runs the operations of a group that came to nothing for this reason again, each in a transaction of its own:
     /// what one of them broke is not held against the others.
-    async fn each_alone(&mut self, group: Vec<Ran>, error: Error) {
+    async fn each_alone(&mut self, group: Vec<Executed>, error: Error) {
         let one = group.len() == 1;
         for (mut operation, _) in group {
             let mut committed = if one { Err(error.clone()) } else { self.alone(operation.as_mut()).await };
             if let Err(error) = committed {
-                committed = self.with_reserve(operation.as_mut(), error).await;
+                committed = self.with_ballast(operation.as_mut(), error).await;
             }
             operation.answer(committed);
         }
@@ -191,20 +191,20 @@ impl Desk {
         committed
     }
 
-    /// Gives the reserve up for an operation that found no room, and runs it again: one that begins something only once
-    /// the log is cut and there is a reserve beside it again.
-    async fn with_reserve(&mut self, operation: &mut dyn Waiting, error: Error) -> Result<(), Error> {
-        if !self.can_help(&error) || !self.reserve.give_up() {
+    /// Gives the ballast up for an operation that found no room, and runs it again: one that begins something only once
+    /// the log is cut and there is ballast beside it again.
+    async fn with_ballast(&mut self, operation: &mut dyn Waiting, error: Error) -> Result<(), Error> {
+        if !self.can_help(&error) || !self.ballast.give_up() {
             return Err(error);
         }
         self.cut_log();
-        let begins = matches!(operation.moves(), Moves::Begins(_));
-        if begins && !self.reserve.restore() { Err(error) } else { self.alone(operation).await }
+        let begins = matches!(operation.intent(), WriteIntent::Begins(_));
+        if begins && !self.ballast.restore() { Err(error) } else { self.alone(operation).await }
     }
 
-    /// Whether the reserve may be what an operation lacks.
+    /// Whether the ballast may be what an operation lacks.
     fn can_help(&self, error: &Error) -> bool {
-        matches!(error, Error::NoSpace(_)) && self.reserve.is_whole()
+        matches!(error, Error::NoSpace(_)) && self.ballast.is_whole()
     }
 
     /// Where it cannot be cut, nothing is lost: it is tried again.
@@ -214,18 +214,18 @@ impl Desk {
         }
     }
 
-    /// Writes a log of so many pages at least back. Where the disk has no room for that, the reserve may have: a log
+    /// Writes a log of so many pages at least back. Where the disk has no room for that, the ballast may have: a log
     /// that is cut gives more than it takes.
     fn write_log_back(&mut self, least_pages: i64) {
         let written = self.connection().and_then(|connection| connection.write_log_back(least_pages));
         let gave_lately = self.gave_for_log.is_some_and(|at| at.elapsed() < RETRY);
         match written {
             Ok(Log::Short) => self.gave_for_log = None,
-            Ok(Log::Lacks(bytes)) if bytes <= RESERVE_BYTES && !gave_lately => {
-                if self.reserve.give_up() {
+            Ok(Log::Lacks(bytes)) if bytes <= BALLAST_BYTES && !gave_lately => {
+                if self.ballast.give_up() {
                     self.gave_for_log = Some(Instant::now());
                     self.cut_log();
-                    self.reserve.restore();
+                    self.ballast.restore();
                 }
             }
             Ok(Log::Lacks(_)) => {}
@@ -234,7 +234,7 @@ impl Desk {
     }
 
     fn vacuum_pays(&mut self) -> Result<bool, Error> {
-        let kept = if self.reserve.is_whole() { RESERVE_BYTES } else { 0 };
+        let kept = if self.ballast.is_whole() { BALLAST_BYTES } else { 0 };
         self.connection().and_then(|connection| connection.vacuum_pays(kept))
     }
 
@@ -248,15 +248,15 @@ impl Desk {
         }
     }
 
-    /// Runs an operation in the transaction that is open. Without a reserve, what is left is for what ends what was
+    /// Runs an operation in the transaction that is open. Without ballast, what is left is for what ends what was
     /// begun: an operation that begins something is refused, unless it finds that it has nothing to write.
     async fn run(&mut self, operation: &mut dyn Waiting) -> Result<(), Error> {
-        let is_bound = matches!(operation.moves(), Moves::Begins(_)) && !self.reserve.restore();
+        let is_bound = matches!(operation.intent(), WriteIntent::Begins(_)) && !self.ballast.restore();
         let connection = self.connection()?;
         let before = connection.changes();
         operation.run(connection).await?;
         match is_bound && connection.changes() != before {
-            true => Err(self.reserve.refusal()),
+            true => Err(self.ballast.refusal()),
             false => Ok(()),
         }
     }

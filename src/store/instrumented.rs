@@ -1,13 +1,13 @@
-//! A store that tells the metrics how long each of its operations took and which came too late, whatever implements it.
+//! A store that reports to the metrics how long each of its operations took and which came too late, whatever implements it.
 
 use std::sync::Arc;
 use std::time::{Duration, SystemTime};
 
 use super::{
-    BegunUpload, CancelReply, Claim, Claims, Created, EncodedResult, Ending, Error, Heartbeat, Hint, InputPage,
-    InputQuery, JobPage, JobQuery, Lease, Load, NewInput, NewRecord, NewUpload, PurgedUploads, QueueBounds,
-    QueueReport, RetryReply, Store, StoreStats, StoredInput, Swept, UploadBounds, UploadLease, UploadStatus,
-    WebhookOutcome, WebhookQueue, Work,
+    BegunUpload, CancelReply, Claim, Claims, Created, EncodedResult, Ending, Error, Heartbeat, InputPage, InputQuery,
+    JobPage, JobPayload, JobQuery, Lease, NewInput, NewRecord, NewUpload, Notification, PurgedUploads, QueueBounds,
+    QueueReport, QueueStats, RetryReply, Store, StoreStats, StoredInput, Swept, UploadBounds, UploadLease,
+    UploadStatus, WebhookOutcome, WebhookQueue,
 };
 use crate::domain::InputName;
 use crate::domain::job::{Job, JobEvent, JobName};
@@ -17,7 +17,7 @@ use crate::telemetry::metrics::{store_operation, write_fenced};
 /// Times every operation of the store inside. Failed operations count too: a slow failure is still slow. Writes that
 /// were refused because the lease was gone are counted.
 #[derive(Debug)]
-pub struct Timed<S>(pub S);
+pub struct InstrumentedStore<S>(pub S);
 
 /// Counts a write that came too late.
 fn counted<T>(operation: &'static str, result: Result<T, Error>) -> Result<T, Error> {
@@ -28,7 +28,7 @@ fn counted<T>(operation: &'static str, result: Result<T, Error>) -> Result<T, Er
 }
 
 #[async_trait::async_trait]
-impl<S: Store> Store for Timed<S> {
+impl<S: Store> Store for InstrumentedStore<S> {
     async fn create_jobs(
         &self,
         new: Vec<NewRecord>,
@@ -59,9 +59,9 @@ impl<S: Store> Store for Timed<S> {
         self.0.claim(claim, now).await
     }
 
-    async fn work(&self, name: &JobName) -> Result<Work, Error> {
+    async fn job_payload(&self, name: &JobName) -> Result<JobPayload, Error> {
         let _timer = store_operation("work");
-        self.0.work(name).await
+        self.0.job_payload(name).await
     }
 
     async fn heartbeat(&self, lease: &Lease, now: SystemTime, lease_for: Duration) -> Result<Heartbeat, Error> {
@@ -220,9 +220,9 @@ impl<S: Store> Store for Timed<S> {
         self.0.purge_uploads(abandoned_by, unused_since).await
     }
 
-    async fn load(&self) -> Result<Load, Error> {
+    async fn queue_stats(&self) -> Result<QueueStats, Error> {
         let _timer = store_operation("load");
-        self.0.load().await
+        self.0.queue_stats().await
     }
 
     async fn webhook_queue(&self, now: SystemTime) -> Result<WebhookQueue, Error> {
@@ -258,9 +258,9 @@ impl<S: Store> Store for Timed<S> {
         self.0.has_room()
     }
 
-    /// Not timed: it waits for others.
-    async fn hint(&self) -> Hint {
-        self.0.hint().await
+    /// Not measured: it waits for others.
+    async fn notification(&self) -> Notification {
+        self.0.notification().await
     }
 
     async fn close(&self) {
@@ -281,7 +281,7 @@ mod tests {
         let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build().expect("a runtime");
         let late = async {
             let directory = tempfile::tempdir().expect("a temporary directory");
-            let store = Timed(Sqlite::open(directory.path()).await.expect("opens"));
+            let store = InstrumentedStore(Sqlite::open(directory.path()).await.expect("opens"));
             store.create_job(contract::record("a"), &contract::ROOM, contract::time(0)).await.expect("created");
             let claim = Claim::one("w", Duration::from_secs(1));
             let claims = store.claim(&claim, contract::time(0)).await.expect("claims");
