@@ -9,98 +9,98 @@ async fn a_full_queue_refuses_at_once_and_takes_on_again() {
     let mut options = workers(1);
     options.queue.max_jobs = 1;
     options.retry_after = Duration::from_secs(17);
-    let bench = TestEngine::start(options).await;
-    bench.submit(Script::Wait).await;
-    bench.gate.until_waiting(1).await;
-    let waiting = bench.submit(Script::Wait).await;
-    match bench.engine.submit(new_job(Script::Wait)).await {
+    let test = TestEngine::start(options).await;
+    test.submit(Behavior::Wait).await;
+    test.solver.until_waiting(1).await;
+    let waiting = test.submit(Behavior::Wait).await;
+    match test.engine.submit(new_job(Behavior::Wait)).await {
         Err(Error::QueueFull { retry_after, bound, message }) => {
             assert_eq!((retry_after, bound), (Duration::from_secs(17), "jobs"));
             assert_eq!(message, "the queue is full: 1 of at most 1 jobs wait");
         }
         other => panic!("{other:?}"),
     }
-    bench.engine.cancel(&waiting).await.expect("exists");
-    bench.submit(Script::Wait).await;
+    test.engine.cancel(&waiting).await.expect("exists");
+    test.submit(Behavior::Wait).await;
 }
 
 #[tokio::test]
 async fn one_request_is_one_job_however_often_it_is_sent() {
-    let bench = TestEngine::start(workers(1)).await;
-    let request = |script| NewJob { request_id: Some("r-1".into()), ..new_job(script) };
-    let calls = (0..20).map(|_| bench.engine.submit(request(Script::Succeed)));
+    let test = TestEngine::start(workers(1)).await;
+    let request = |behavior| NewJob { request_id: Some("r-1".into()), ..new_job(behavior) };
+    let calls = (0..20).map(|_| test.engine.submit(request(Behavior::Succeed)));
     let jobs = futures_util::future::join_all(calls).await;
     let name = jobs[0].as_ref().expect("admitted").name.clone();
     for job in jobs {
         assert_eq!(job.expect("the same request").name, name);
     }
-    bench.ended(&name).await;
-    let late = bench.engine.submit(request(Script::Succeed)).await.expect("the same request");
+    test.ended(&name).await;
+    let late = test.engine.submit(request(Behavior::Succeed)).await.expect("the same request");
     assert_eq!((&late.name, late.state), (&name, JobState::Succeeded));
-    let traced = NewJob { trace_parent: Some("another call".into()), ..request(Script::Succeed) };
-    assert_eq!(bench.engine.submit(traced).await.expect("the same request").name, name);
+    let traced = NewJob { trace_parent: Some("another call".into()), ..request(Behavior::Succeed) };
+    assert_eq!(test.engine.submit(traced).await.expect("the same request").name, name);
     for other in [
-        request(Script::Wait),
-        NewJob { priority: 1, ..request(Script::Succeed) },
-        NewJob { job_id: Some("mine".into()), ..request(Script::Succeed) },
-        NewJob { deadline: Some(crate::engine::Deadline::After(Duration::from_secs(1))), ..request(Script::Succeed) },
+        request(Behavior::Wait),
+        NewJob { priority: 1, ..request(Behavior::Succeed) },
+        NewJob { job_id: Some("mine".into()), ..request(Behavior::Succeed) },
+        NewJob { deadline: Some(crate::engine::Deadline::After(Duration::from_secs(1))), ..request(Behavior::Succeed) },
     ] {
-        assert!(matches!(bench.engine.submit(other).await, Err(Error::AlreadyExists(_))));
+        assert!(matches!(test.engine.submit(other).await, Err(Error::AlreadyExists(_))));
     }
-    assert_eq!(bench.gate.calls.load(Ordering::SeqCst), 1);
-    assert_eq!(bench.engine.list(&JobQuery::default()).await.expect("lists").jobs.len(), 1);
+    assert_eq!(test.solver.calls.load(Ordering::SeqCst), 1);
+    assert_eq!(test.engine.list(&JobQuery::default()).await.expect("lists").jobs.len(), 1);
 }
 
 #[tokio::test]
 async fn bad_arguments_name_their_field() {
-    let bench = TestEngine::start(workers(1)).await;
+    let test = TestEngine::start(workers(1)).await;
     let fields = |error: Error| match error {
         Error::InvalidArgument(invalid) => {
             invalid.violations().iter().map(|violation| violation.field.clone()).collect::<Vec<_>>()
         }
         other => panic!("{other:?}"),
     };
-    let mut bad = new_job(Script::Succeed);
+    let mut bad = new_job(Behavior::Succeed);
     bad.tenant = "A".into();
     bad.job_id = Some("-".into());
     bad.request_id = Some(String::new());
-    let error = bench.engine.submit(bad).await.expect_err("refused");
+    let error = test.engine.submit(bad).await.expect_err("refused");
     assert_eq!(fields(error), ["tenant", "job_id", "request_id"]);
-    let mut bad = new_job(Script::Succeed);
+    let mut bad = new_job(Behavior::Succeed);
     bad.settings.alpha = f64::NAN;
-    assert_eq!(fields(bench.engine.submit(bad).await.expect_err("refused")), ["job.settings.alpha"]);
+    assert_eq!(fields(test.engine.submit(bad).await.expect_err("refused")), ["job.settings.alpha"]);
     let query = JobQuery { page_token: Some("x".into()), ..JobQuery::default() };
-    assert_eq!(fields(bench.engine.list(&query).await.expect_err("refused")), ["page_token"]);
-    let name = bench.submit(Script::Succeed).await;
-    let last = bench.ended(&name).await.last_sequence;
-    assert_eq!(fields(bench.engine.watch(&name, last + 1).await.expect_err("refused")), ["after_sequence"]);
+    assert_eq!(fields(test.engine.list(&query).await.expect_err("refused")), ["page_token"]);
+    let name = test.submit(Behavior::Succeed).await;
+    let last = test.ended(&name).await.last_sequence;
+    assert_eq!(fields(test.engine.watch(&name, last + 1).await.expect_err("refused")), ["after_sequence"]);
 }
 
 #[tokio::test]
 async fn job_ids_are_the_callers_or_made() {
-    let bench = TestEngine::start(workers(1)).await;
-    let mine = || NewJob { job_id: Some("mine".into()), ..new_job(Script::Succeed) };
-    let job = bench.engine.submit(mine()).await.expect("admitted");
+    let test = TestEngine::start(workers(1)).await;
+    let mine = || NewJob { job_id: Some("mine".into()), ..new_job(Behavior::Succeed) };
+    let job = test.engine.submit(mine()).await.expect("admitted");
     assert_eq!(job.name.to_string(), "tenants/default/jobs/mine");
-    let taken = bench.engine.submit(mine()).await.expect_err("taken");
+    let taken = test.engine.submit(mine()).await.expect_err("taken");
     assert_eq!(taken, Error::AlreadyExists(TakenId::Job(JobName { tenant: "default".into(), job: "mine".into() })));
-    let made = bench.submit(Script::Succeed).await;
+    let made = test.submit(Behavior::Succeed).await;
     assert!(JobName::parse(&made.to_string()).is_some(), "{made}");
     let missing = JobName { tenant: "other".into(), job: "mine".into() };
-    assert_eq!(bench.engine.job(&missing).await, Err(Error::NotFound(missing.clone())));
-    assert_eq!(bench.engine.cancel(&missing).await, Err(Error::NotFound(missing.clone())));
-    assert_eq!(bench.engine.watch(&missing, 0).await.map(|_| ()), Err(Error::NotFound(missing)));
+    assert_eq!(test.engine.job(&missing).await, Err(Error::NotFound(missing.clone())));
+    assert_eq!(test.engine.cancel(&missing).await, Err(Error::NotFound(missing.clone())));
+    assert_eq!(test.engine.watch(&missing, 0).await.map(|_| ()), Err(Error::NotFound(missing)));
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn a_hundred_jobs_of_twenty_callers_on_two_workers_all_end() {
-    let bench = TestEngine::start(workers(2)).await;
+    let test = TestEngine::start(workers(2)).await;
     let callers = (0..20).map(|_| {
-        let engine = bench.engine.clone();
+        let engine = test.engine.clone();
         tokio::spawn(async move {
             let mut names = Vec::new();
             for _ in 0..5 {
-                names.push(engine.submit(new_job(Script::Succeed)).await.expect("admitted").name);
+                names.push(engine.submit(new_job(Behavior::Succeed)).await.expect("admitted").name);
             }
             for name in &names {
                 let mut watch = engine.watch(name, 0).await.expect("exists");
@@ -121,7 +121,7 @@ async fn a_hundred_jobs_of_twenty_callers_on_two_workers_all_end() {
     names.dedup();
     assert_eq!(names.len(), 100);
     // One that is prefetched while another slot begins it may be begun for nothing.
-    assert!(bench.gate.calls.load(Ordering::SeqCst) >= 100);
-    assert_eq!(bench.engine.queue_stats().await.expect("counts"), crate::engine::QueueStats::default());
-    eventually(|| async { (bench.engine.inner.notifier.channel_count() == 0).then_some(()) }).await;
+    assert!(test.solver.calls.load(Ordering::SeqCst) >= 100);
+    assert_eq!(test.engine.queue_stats().await.expect("counts"), crate::engine::QueueStats::default());
+    eventually(|| async { (test.engine.inner.notifier.channel_count() == 0).then_some(()) }).await;
 }

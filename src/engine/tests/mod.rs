@@ -1,4 +1,4 @@
-//! The engine over a real SQLite store and a solver that does as it is told.
+//! The engine over a real SQLite store and a solver that behaves as each job asks.
 
 mod admission;
 mod lifecycle;
@@ -26,35 +26,35 @@ use crate::solver;
 use crate::store::Store;
 use crate::store::sqlite::Sqlite;
 
-/// What the solver is to do with a job, told through the job's seed.
+/// What the solver is to do with a job, passed as the job's seed.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-enum Script {
+enum Behavior {
     /// One progress, then the solution.
     Succeed = 0,
     Fail = 1,
     Panic = 2,
-    /// One progress, then nothing until it is stopped or the gate opens, then the solution.
+    /// One progress, then nothing until it is stopped or released, then the solution.
     Wait = 3,
     /// The same, deaf to being stopped.
     Deaf = 4,
-    /// Interim weights 1 to 50, then as [`Script::Wait`].
+    /// Interim weights 1 to 50, then as [`Behavior::Wait`].
     Weights = 5,
-    /// A thousand progress records at once, then as [`Script::Wait`].
+    /// A thousand progress records at once, then as [`Behavior::Wait`].
     Chatter = 6,
 }
 
-/// Lets the solvers of a test through, and counts their calls.
+/// A solver whose calls behave as their jobs ask, wait until they are released, and are counted.
 #[derive(Debug, Default)]
-struct Gate {
-    open: AtomicU32,
+struct FakeSolver {
+    released: AtomicU32,
     calls: AtomicU64,
     /// Jobs that reached their waiting point.
     waiting: AtomicU32,
 }
 
-impl Gate {
-    fn open(&self) {
-        self.open.store(1, Ordering::SeqCst);
+impl FakeSolver {
+    fn release(&self) {
+        self.released.store(1, Ordering::SeqCst);
     }
 
     /// Until `count` solvers in all have come to their waiting point.
@@ -62,9 +62,9 @@ impl Gate {
         eventually(|| async { (self.waiting.load(Ordering::SeqCst) >= count).then_some(()) }).await;
     }
 
-    fn solver(self: &Arc<Self>) -> Solver {
-        let gate = self.clone();
-        Arc::new(move |input, settings, observer, stop| gate.solve(input, settings, observer, stop))
+    fn solver_fn(self: &Arc<Self>) -> Solver {
+        let solver = self.clone();
+        Arc::new(move |input, settings, observer, stop| solver.solve(input, settings, observer, stop))
     }
 
     fn solve(
@@ -75,24 +75,24 @@ impl Gate {
         stop: &StopToken,
     ) -> Result<Solution, solver::Error> {
         let call = self.calls.fetch_add(1, Ordering::SeqCst) + 1;
-        let is = |script: Script| settings.seed == script as u64;
+        let is = |behavior: Behavior| settings.seed == behavior as u64;
         observer.stage(Stage::Prepare);
-        if is(Script::Fail) {
+        if is(Behavior::Fail) {
             return Err(solver::Error::Internal("told to fail".into()));
         }
-        if is(Script::Panic) {
+        if is(Behavior::Panic) {
             panic!("told to panic");
         }
         observer.stage(Stage::Search);
-        for iteration in 1..=if is(Script::Chatter) { 1000 } else { 1 } {
+        for iteration in 1..=if is(Behavior::Chatter) { 1000 } else { 1 } {
             observer.progress(&progress(iteration));
         }
-        if is(Script::Weights) {
+        if is(Behavior::Weights) {
             (1..=50).for_each(|iteration| observer.weights(iteration, &[iteration as f32; 3]));
         }
         self.waiting.fetch_add(1, Ordering::SeqCst);
-        while !is(Script::Succeed) && self.open.load(Ordering::SeqCst) == 0 {
-            if let Some(reason) = stop.reason().filter(|_| !is(Script::Deaf)) {
+        while !is(Behavior::Succeed) && self.released.load(Ordering::SeqCst) == 0 {
+            if let Some(reason) = stop.reason().filter(|_| !is(Behavior::Deaf)) {
                 return Err(solver::Error::Stopped(reason));
             }
             std::thread::sleep(Duration::from_millis(1));
@@ -170,28 +170,28 @@ fn input() -> Input {
     Input::new(raw, &Limits::default(), "test").expect("valid")
 }
 
-fn new_job(script: Script) -> NewJob {
-    NewJob::new(DEFAULT_TENANT, input(), SolveSettings { seed: script as u64, ..SolveSettings::default() })
+fn new_job(behavior: Behavior) -> NewJob {
+    NewJob::new(DEFAULT_TENANT, input(), SolveSettings { seed: behavior as u64, ..SolveSettings::default() })
 }
 
 /// An engine over a store in a directory of its own.
 struct TestEngine {
     engine: Engine,
     store: Arc<Sqlite>,
-    gate: Arc<Gate>,
+    solver: Arc<FakeSolver>,
     directory: TempDir,
 }
 
 impl TestEngine {
     async fn start(options: Options) -> Self {
         let directory = tempfile::tempdir().expect("a temporary directory");
-        let gate = Arc::new(Gate::default());
-        let (engine, store) = start(options, &directory, &gate).await;
-        Self { engine, store, gate, directory }
+        let solver = Arc::new(FakeSolver::default());
+        let (engine, store) = start(options, &directory, &solver).await;
+        Self { engine, store, solver, directory }
     }
 
-    async fn submit(&self, script: Script) -> JobName {
-        self.engine.submit(new_job(script)).await.expect("admitted").name
+    async fn submit(&self, behavior: Behavior) -> JobName {
+        self.engine.submit(new_job(behavior)).await.expect("admitted").name
     }
 
     /// The job once it has ended.
@@ -200,11 +200,11 @@ impl TestEngine {
     }
 }
 
-async fn start(options: Options, directory: &TempDir, gate: &Arc<Gate>) -> (Engine, Arc<Sqlite>) {
+async fn start(options: Options, directory: &TempDir, solver: &Arc<FakeSolver>) -> (Engine, Arc<Sqlite>) {
     // The engine before may still be letting go of the directory.
     let store = eventually(|| async { Sqlite::open(directory.path()).await.ok() }).await;
     let store = Arc::new(store);
-    let engine = Engine::start(options, store.clone(), gate.solver(), encode).await.expect("starts");
+    let engine = Engine::start(options, store.clone(), solver.solver_fn(), encode).await.expect("starts");
     (engine, store)
 }
 

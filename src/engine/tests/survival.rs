@@ -9,39 +9,39 @@ use crate::engine::{Drained, Error, StoreState, locked};
 
 #[tokio::test]
 async fn a_drain_lets_what_runs_finish_and_leaves_what_waits() {
-    let bench = TestEngine::start(workers(1)).await;
-    let running = bench.submit(Script::Wait).await;
-    bench.gate.until_waiting(1).await;
-    let queued = bench.submit(Script::Wait).await;
-    let engine = bench.engine.clone();
+    let test = TestEngine::start(workers(1)).await;
+    let running = test.submit(Behavior::Wait).await;
+    test.solver.until_waiting(1).await;
+    let queued = test.submit(Behavior::Wait).await;
+    let engine = test.engine.clone();
     let drain = tokio::spawn(async move { engine.drain(Duration::from_secs(120)).await });
-    eventually(|| async { bench.engine.is_draining().then_some(()) }).await;
-    assert_eq!(bench.engine.submit(new_job(Script::Wait)).await, Err(Error::Draining));
-    bench.gate.open();
+    eventually(|| async { test.engine.is_draining().then_some(()) }).await;
+    assert_eq!(test.engine.submit(new_job(Behavior::Wait)).await, Err(Error::Draining));
+    test.solver.release();
     assert_eq!(drain.await.expect("no panic"), Drained { finished: 1, given_back: 0 });
-    assert_eq!(bench.engine.job(&running).await.expect("exists").state, JobState::Succeeded);
-    assert_eq!(bench.engine.job(&queued).await.expect("exists").state, JobState::Queued);
-    assert_eq!(bench.engine.drain(Duration::ZERO).await, Drained::default(), "once is enough");
+    assert_eq!(test.engine.job(&running).await.expect("exists").state, JobState::Succeeded);
+    assert_eq!(test.engine.job(&queued).await.expect("exists").state, JobState::Queued);
+    assert_eq!(test.engine.drain(Duration::ZERO).await, Drained::default(), "once is enough");
 }
 
 #[tokio::test]
 async fn interrupt_running_ends_the_wait_of_a_drain() {
     for before in [true, false] {
-        let bench = TestEngine::start(workers(1)).await;
-        let name = bench.submit(Script::Wait).await;
-        bench.gate.until_waiting(1).await;
+        let test = TestEngine::start(workers(1)).await;
+        let name = test.submit(Behavior::Wait).await;
+        test.solver.until_waiting(1).await;
         if before {
-            bench.engine.interrupt_running();
+            test.engine.interrupt_running();
         }
-        let engine = bench.engine.clone();
+        let engine = test.engine.clone();
         let drain = tokio::spawn(async move { engine.drain(Duration::from_secs(3600)).await });
-        eventually(|| async { bench.engine.is_draining().then_some(()) }).await;
+        eventually(|| async { test.engine.is_draining().then_some(()) }).await;
         if !before {
-            bench.engine.interrupt_running();
+            test.engine.interrupt_running();
         }
         let drained = tokio::time::timeout(Duration::from_secs(120), drain).await.expect("an end").expect("no panic");
         assert_eq!(drained, Drained { finished: 0, given_back: 1 }, "before: {before}");
-        assert_eq!(bench.engine.job(&name).await.expect("exists").state, JobState::Queued);
+        assert_eq!(test.engine.job(&name).await.expect("exists").state, JobState::Queued);
     }
     let idle = TestEngine::start(workers(1)).await;
     idle.engine.interrupt_running();
@@ -50,11 +50,11 @@ async fn interrupt_running_ends_the_wait_of_a_drain() {
 
 #[tokio::test]
 async fn those_who_follow_the_store_hear_of_changes_alone() {
-    let bench = TestEngine::start(workers(1)).await;
-    let mut states = bench.engine.store_state();
+    let test = TestEngine::start(workers(1)).await;
+    let mut states = test.engine.store_state();
     let look = async || {
         for _ in 0..3 {
-            bench.engine.inner.sweep().await;
+            test.engine.inner.sweep().await;
         }
     };
     assert_eq!(*states.borrow_and_update(), StoreState::Healthy);
@@ -62,10 +62,10 @@ async fn those_who_follow_the_store_hear_of_changes_alone() {
     assert!(!states.has_changed().expect("an engine"), "nothing happened");
 
     // As on a full disk: a write finds no room, and where the reserve is made is none.
-    let in_the_way = bench.directory.path().join("scpsfm.reserve.new");
+    let in_the_way = test.directory.path().join("scpsfm.reserve.new");
     std::fs::create_dir(&in_the_way).expect("a folder");
-    bench.store.find_no_room().await;
-    assert!(matches!(bench.engine.submit(new_job(Script::Succeed)).await, Err(Error::NoSpace(_))));
+    test.store.find_no_room().await;
+    assert!(matches!(test.engine.submit(new_job(Behavior::Succeed)).await, Err(Error::NoSpace(_))));
     look().await;
     assert_eq!(*states.borrow_and_update(), StoreState::Full);
     look().await;
@@ -75,33 +75,34 @@ async fn those_who_follow_the_store_hear_of_changes_alone() {
     let room = states.wait_for(|state| *state == StoreState::Healthy);
     tokio::time::timeout(Duration::from_secs(120), room).await.expect("room within two minutes").expect("an engine");
     // The next connection knows nothing of the limit.
-    bench.store.execute("PRAGMA max_page_count = 1073741823").await;
-    let name = bench.submit(Script::Succeed).await;
-    assert_eq!(bench.ended(&name).await.state, JobState::Succeeded);
+    test.store.execute("PRAGMA max_page_count = 1073741823").await;
+    let name = test.submit(Behavior::Succeed).await;
+    assert_eq!(test.ended(&name).await.state, JobState::Succeeded);
 }
 
 #[tokio::test]
 async fn what_is_claimed_while_a_drain_gives_back_goes_back_too() {
     // The claim is on its way to the store when the drain looks for what runs: after one of these turns, or some.
     for turns in 0..8 {
-        let bench = TestEngine::start(workers(1)).await;
-        let name = bench.submit(Script::Wait).await;
+        let test = TestEngine::start(workers(1)).await;
+        let name = test.submit(Behavior::Wait).await;
         for _ in 0..turns {
             tokio::task::yield_now().await;
         }
-        bench.engine.drain(Duration::ZERO).await;
-        let job = bench.engine.job(&name).await.expect("the job");
+        test.engine.drain(Duration::ZERO).await;
+        let job = test.engine.job(&name).await.expect("the job");
         assert_eq!(job.state, JobState::Queued, "after {turns} turns");
     }
 }
 
 #[tokio::test]
 async fn a_drain_gives_back_what_does_not_finish_and_the_next_engine_takes_it_up() {
-    let bench = TestEngine::start(workers(2)).await;
-    let names = [bench.submit(Script::Wait).await, bench.submit(Script::Wait).await, bench.submit(Script::Wait).await];
-    bench.gate.until_waiting(2).await;
-    let mut watch = bench.engine.watch(&names[0], 0).await.expect("exists");
-    assert_eq!(bench.engine.drain(Duration::ZERO).await, Drained { finished: 0, given_back: 2 });
+    let test = TestEngine::start(workers(2)).await;
+    let names =
+        [test.submit(Behavior::Wait).await, test.submit(Behavior::Wait).await, test.submit(Behavior::Wait).await];
+    test.solver.until_waiting(2).await;
+    let mut watch = test.engine.watch(&names[0], 0).await.expect("exists");
+    assert_eq!(test.engine.drain(Duration::ZERO).await, Drained { finished: 0, given_back: 2 });
     let mut seen = Vec::new();
     let end = loop {
         match watch.next().await.expect("an event or an error") {
@@ -111,14 +112,14 @@ async fn a_drain_gives_back_what_does_not_finish_and_the_next_engine_takes_it_up
     };
     assert_eq!(end, Error::Draining);
     assert!(watch.next().await.is_none());
-    let TestEngine { engine, store, gate, directory } = bench;
+    let TestEngine { engine, store, solver, directory } = test;
     for name in &names {
         assert_eq!(engine.job(name).await.expect("exists").state, JobState::Queued);
     }
     drop((engine, store, watch));
 
-    gate.open();
-    let (engine, _store) = start(workers(1), &directory, &gate).await;
+    solver.release();
+    let (engine, _store) = start(workers(1), &directory, &solver).await;
     for name in &names {
         assert_eq!(ended(&engine, name).await.state, JobState::Succeeded);
     }
@@ -134,25 +135,25 @@ async fn a_drain_gives_back_what_does_not_finish_and_the_next_engine_takes_it_up
 #[test]
 fn after_a_crash_every_job_is_finished_exactly_once() {
     let directory = tempfile::tempdir().expect("a temporary directory");
-    let gate = Arc::new(Gate::default());
+    let solver = Arc::new(FakeSolver::default());
     let first = Runtime::new().expect("a runtime");
     let (running, queued, mut seen) = first.block_on(async {
-        let (engine, _) = start(workers(1), &directory, &gate).await;
-        let running = engine.submit(new_job(Script::Wait)).await.expect("admitted").name;
+        let (engine, _) = start(workers(1), &directory, &solver).await;
+        let running = engine.submit(new_job(Behavior::Wait)).await.expect("admitted").name;
         let mut watch = engine.watch(&running, 0).await.expect("exists");
         let mut seen = Vec::new();
         while !seen.iter().any(|event: &JobEvent| matches!(event.body, EventBody::Progress(_))) {
             seen.push(watch.next().await.expect("an event").expect("no error"));
         }
-        let queued = engine.submit(new_job(Script::Succeed)).await.expect("admitted").name;
+        let queued = engine.submit(new_job(Behavior::Succeed)).await.expect("admitted").name;
         (running, queued, seen)
     });
     first.shutdown_background();
 
     let second = Runtime::new().expect("a runtime");
     second.block_on(async {
-        let (engine, _) = start(workers(1), &directory, &gate).await;
-        gate.open();
+        let (engine, _) = start(workers(1), &directory, &solver).await;
+        solver.release();
         for name in [&running, &queued] {
             assert_eq!(ended(&engine, name).await.state, JobState::Succeeded);
         }
@@ -169,22 +170,22 @@ fn after_a_crash_every_job_is_finished_exactly_once() {
 #[test]
 fn a_job_that_takes_its_process_down_each_time_fails() {
     let directory = tempfile::tempdir().expect("a temporary directory");
-    let gate = Arc::new(Gate::default());
+    let solver = Arc::new(FakeSolver::default());
     let options = Options { max_attempts: 2, ..workers(1) };
     let mut name = None;
     for life in 1..=2 {
         let runtime = Runtime::new().expect("a runtime");
         runtime.block_on(async {
-            let (engine, _) = start(options.clone(), &directory, &gate).await;
+            let (engine, _) = start(options.clone(), &directory, &solver).await;
             if name.is_none() {
-                name = Some(engine.submit(new_job(Script::Wait)).await.expect("admitted").name);
+                name = Some(engine.submit(new_job(Behavior::Wait)).await.expect("admitted").name);
             }
-            gate.until_waiting(life).await;
+            solver.until_waiting(life).await;
         });
         runtime.shutdown_background();
     }
     Runtime::new().expect("a runtime").block_on(async {
-        let (engine, _) = start(options, &directory, &gate).await;
+        let (engine, _) = start(options, &directory, &solver).await;
         let job = engine.job(&name.expect("submitted")).await.expect("exists");
         assert_eq!((job.state, job.attempt), (JobState::Failed, 2));
         assert_eq!(job.failure.expect("a reason").reason, "ATTEMPTS_EXHAUSTED");
@@ -195,21 +196,21 @@ fn a_job_that_takes_its_process_down_each_time_fails() {
 async fn a_worker_whose_lease_was_taken_over_changes_nothing() {
     // Heartbeats far apart: the first worker learns of its loss only when it wants to write its result.
     let options = Options { lease: Duration::from_secs(3000), ..workers(2) };
-    let bench = TestEngine::start(options).await;
-    let name = bench.submit(Script::Deaf).await;
-    bench.gate.until_waiting(1).await;
+    let test = TestEngine::start(options).await;
+    let name = test.submit(Behavior::Deaf).await;
+    test.solver.until_waiting(1).await;
     let much_later = SystemTime::now() + Duration::from_secs(4000);
-    let lost = bench.store.sweep(much_later, 3).await.expect("sweeps").lost;
+    let lost = test.store.sweep(much_later, 3).await.expect("sweeps").lost;
     assert_eq!(lost.len(), 1);
     // The second worker finds the job by itself; both wait now, and end in any order.
-    bench.gate.until_waiting(2).await;
-    bench.gate.open();
-    let job = bench.ended(&name).await;
+    test.solver.until_waiting(2).await;
+    test.solver.release();
+    let job = test.ended(&name).await;
     assert_eq!((job.state, job.attempt), (JobState::Succeeded, 2));
-    assert_eq!(call_of(&bench.engine, &name).await, 2, "the second call's");
-    bench.engine.drain(Duration::from_secs(120)).await;
-    assert_eq!(bench.engine.job(&name).await, Ok(job), "also after the first worker has ended");
-    let events = bench.store.events_after(&name, 0, 100).await.expect("events");
+    assert_eq!(call_of(&test.engine, &name).await, 2, "the second call's");
+    test.engine.drain(Duration::from_secs(120)).await;
+    assert_eq!(test.engine.job(&name).await, Ok(job), "also after the first worker has ended");
+    let events = test.store.events_after(&name, 0, 100).await.expect("events");
     assert_contiguous(&events, 1);
     assert_eq!(events.iter().filter_map(terminal).count(), 1);
 }
@@ -217,15 +218,15 @@ async fn a_worker_whose_lease_was_taken_over_changes_nothing() {
 #[tokio::test]
 async fn a_lost_lease_stops_the_work() {
     let options = Options { lease: Duration::from_millis(300), max_attempts: u32::MAX, ..workers(1) };
-    let bench = TestEngine::start(options).await;
-    let name = bench.submit(Script::Wait).await;
-    bench.gate.until_waiting(1).await;
+    let test = TestEngine::start(options).await;
+    let name = test.submit(Behavior::Wait).await;
+    test.solver.until_waiting(1).await;
     let much_later = SystemTime::now() + Duration::from_secs(60);
-    bench.store.sweep(much_later, u32::MAX).await.expect("sweeps");
+    test.store.sweep(much_later, u32::MAX).await.expect("sweeps");
     // The one worker can only take the job up again after the first attempt has stopped.
-    bench.gate.until_waiting(2).await;
-    bench.gate.open();
-    assert_eq!(bench.ended(&name).await.state, JobState::Succeeded);
+    test.solver.until_waiting(2).await;
+    test.solver.release();
+    assert_eq!(test.ended(&name).await.state, JobState::Succeeded);
 }
 
 /// Statements after which no job can change its state, or none can be written at all, as with a full disk.
@@ -236,48 +237,48 @@ const MENDED: &str = "DROP TRIGGER broken; DROP TRIGGER IF EXISTS broken_too";
 
 #[tokio::test]
 async fn a_result_waits_for_a_store_that_comes_back_in_time() {
-    let bench = TestEngine::start(workers(1)).await;
-    let name = bench.submit(Script::Wait).await;
-    bench.gate.until_waiting(1).await;
-    bench.store.execute(NO_ENDS).await;
-    bench.gate.open();
+    let test = TestEngine::start(workers(1)).await;
+    let name = test.submit(Behavior::Wait).await;
+    test.solver.until_waiting(1).await;
+    test.store.execute(NO_ENDS).await;
+    test.solver.release();
     // Long enough to try in vain; were it not, the test would only show less.
     tokio::time::sleep(Duration::from_millis(50)).await;
-    assert_eq!(bench.engine.job(&name).await.expect("reads work").state, JobState::Running);
-    bench.store.execute(MENDED).await;
-    let job = bench.ended(&name).await;
+    assert_eq!(test.engine.job(&name).await.expect("reads work").state, JobState::Running);
+    test.store.execute(MENDED).await;
+    let job = test.ended(&name).await;
     assert_eq!((job.state, job.attempt), (JobState::Succeeded, 1));
-    assert_eq!(bench.gate.calls.load(Ordering::SeqCst), 1);
+    assert_eq!(test.solver.calls.load(Ordering::SeqCst), 1);
 }
 
 #[tokio::test]
 async fn without_a_store_for_a_lease_the_work_stops_and_later_goes_on_by_itself() {
     let options = Options { lease: Duration::from_millis(300), max_attempts: u32::MAX, ..workers(1) };
-    let bench = TestEngine::start(options).await;
-    let name = bench.submit(Script::Wait).await;
-    bench.gate.until_waiting(1).await;
-    bench.store.execute(NO_WRITES).await;
-    eventually(|| async { locked(&bench.engine.inner.running).is_empty().then_some(()) }).await;
-    assert_eq!(bench.engine.job(&name).await.expect("reads work").state, JobState::Running, "as far as is known");
-    assert!(matches!(bench.engine.submit(new_job(Script::Wait)).await, Err(Error::Unavailable(_))));
-    bench.store.execute(MENDED).await;
-    bench.gate.open();
-    let job = bench.ended(&name).await;
+    let test = TestEngine::start(options).await;
+    let name = test.submit(Behavior::Wait).await;
+    test.solver.until_waiting(1).await;
+    test.store.execute(NO_WRITES).await;
+    eventually(|| async { locked(&test.engine.inner.running).is_empty().then_some(()) }).await;
+    assert_eq!(test.engine.job(&name).await.expect("reads work").state, JobState::Running, "as far as is known");
+    assert!(matches!(test.engine.submit(new_job(Behavior::Wait)).await, Err(Error::Unavailable(_))));
+    test.store.execute(MENDED).await;
+    test.solver.release();
+    let job = test.ended(&name).await;
     assert_eq!(job.state, JobState::Succeeded);
     assert!(job.attempt > 1, "{}", job.attempt);
-    assert_contiguous(&rest(&mut bench.engine.watch(&name, 0).await.expect("exists")).await, 1);
+    assert_contiguous(&rest(&mut test.engine.watch(&name, 0).await.expect("exists")).await, 1);
 }
 
 #[tokio::test]
 async fn a_cancel_reaches_the_attempt_that_holds_the_lease_though_another_still_runs() {
-    let bench = TestEngine::start(Options { lease: Duration::from_secs(3000), ..workers(2) }).await;
-    let name = bench.submit(Script::Deaf).await;
-    bench.gate.until_waiting(1).await;
-    bench.store.sweep(SystemTime::now() + Duration::from_secs(4000), 3).await.expect("sweeps");
-    bench.gate.until_waiting(2).await;
-    bench.engine.cancel(&name).await.expect("exists");
-    let tokens: Vec<_> = locked(&bench.engine.inner.running).values().map(StopToken::is_stopped).collect();
+    let test = TestEngine::start(Options { lease: Duration::from_secs(3000), ..workers(2) }).await;
+    let name = test.submit(Behavior::Deaf).await;
+    test.solver.until_waiting(1).await;
+    test.store.sweep(SystemTime::now() + Duration::from_secs(4000), 3).await.expect("sweeps");
+    test.solver.until_waiting(2).await;
+    test.engine.cancel(&name).await.expect("exists");
+    let tokens: Vec<_> = locked(&test.engine.inner.running).values().map(StopToken::is_stopped).collect();
     assert_eq!(tokens, [true, true]);
-    bench.gate.open();
-    bench.ended(&name).await;
+    test.solver.release();
+    test.ended(&name).await;
 }

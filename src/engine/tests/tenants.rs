@@ -3,29 +3,29 @@
 use super::*;
 use crate::store::TenantShares;
 
-fn of(tenant: &str, script: Script) -> NewJob {
-    NewJob { tenant: tenant.into(), ..new_job(script) }
+fn of(tenant: &str, behavior: Behavior) -> NewJob {
+    NewJob { tenant: tenant.into(), ..new_job(behavior) }
 }
 
 /// The place of tenant `b`'s single job among those that one worker solves, the first of tenant `a`'s five being solved
 /// when it comes. `second_in_hand`: the second of them is prefetched then.
 async fn place_of_the_single_job(short_job: Duration, second_in_hand: bool) -> u32 {
-    let bench = TestEngine::start(Options { short_job, ..workers(1) }).await;
-    let mut many = vec![of("a", Script::Wait)];
-    many.extend((0..4).map(|_| NewJob { priority: 9, ..of("a", Script::Succeed) }));
+    let test = TestEngine::start(Options { short_job, ..workers(1) }).await;
+    let mut many = vec![of("a", Behavior::Wait)];
+    many.extend((0..4).map(|_| NewJob { priority: 9, ..of("a", Behavior::Succeed) }));
     many[0].priority = 10;
-    let many = bench.engine.submit_batch(many).await.expect("admitted");
-    bench.gate.until_waiting(1).await;
+    let many = test.engine.submit_batch(many).await.expect("admitted");
+    test.solver.until_waiting(1).await;
     if second_in_hand {
-        eventually(|| async { (bench.engine.inner.notifier.channel_count() == 2).then_some(()) }).await;
+        eventually(|| async { (test.engine.inner.notifier.channel_count() == 2).then_some(()) }).await;
     }
-    let single = bench.engine.submit(of("b", Script::Succeed)).await.expect("admitted").name;
-    bench.gate.open();
+    let single = test.engine.submit(of("b", Behavior::Succeed)).await.expect("admitted").name;
+    test.solver.release();
     for job in &many {
-        bench.ended(&job.name).await;
+        test.ended(&job.name).await;
     }
-    bench.ended(&single).await;
-    call_of(&bench.engine, &single).await
+    test.ended(&single).await;
+    call_of(&test.engine, &single).await
 }
 
 #[tokio::test]
@@ -37,21 +37,22 @@ async fn a_single_job_waits_for_the_one_that_runs_and_a_prefetched_one() {
 #[tokio::test]
 async fn of_a_tenant_no_more_jobs_run_than_it_may() {
     let shares = Arc::new(TenantShares { max_running: Some(1), ..TenantShares::default() });
-    let bench = TestEngine::start(Options { shares, ..workers(2) }).await;
-    let both = bench.engine.submit_batch(vec![of("a", Script::Wait), of("a", Script::Wait)]).await.expect("admitted");
-    bench.gate.until_waiting(1).await;
+    let test = TestEngine::start(Options { shares, ..workers(2) }).await;
+    let both =
+        test.engine.submit_batch(vec![of("a", Behavior::Wait), of("a", Behavior::Wait)]).await.expect("admitted");
+    test.solver.until_waiting(1).await;
     // The other worker looks for work, and finds another tenant's.
     for _ in 0..3 {
-        let other = bench.engine.submit(of("b", Script::Succeed)).await.expect("admitted").name;
-        assert_eq!(bench.ended(&other).await.state, JobState::Succeeded);
+        let other = test.engine.submit(of("b", Behavior::Succeed)).await.expect("admitted").name;
+        assert_eq!(test.ended(&other).await.state, JobState::Succeeded);
     }
-    assert_eq!(bench.engine.job(&both[1].name).await.expect("exists").state, JobState::Queued);
-    bench.engine.cancel(&both[0].name).await.expect("exists");
+    assert_eq!(test.engine.job(&both[1].name).await.expect("exists").state, JobState::Queued);
+    test.engine.cancel(&both[0].name).await.expect("exists");
     eventually(|| async {
-        let job = bench.engine.job(&both[1].name).await.expect("exists");
+        let job = test.engine.job(&both[1].name).await.expect("exists");
         (job.state == JobState::Running).then_some(())
     })
     .await;
-    bench.gate.open();
-    assert_eq!(bench.ended(&both[1].name).await.state, JobState::Succeeded);
+    test.solver.release();
+    assert_eq!(test.ended(&both[1].name).await.state, JobState::Succeeded);
 }

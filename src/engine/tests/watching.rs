@@ -9,15 +9,15 @@ use crate::store::Lease;
 
 #[tokio::test]
 async fn the_first_progress_is_stored_while_the_job_runs_and_a_flood_is_thinned() {
-    let bench = TestEngine::start(workers(1)).await;
-    let name = bench.submit(Script::Chatter).await;
-    let watch = bench.engine.watch(&name, 1).await.expect("exists").into_stream();
+    let test = TestEngine::start(workers(1)).await;
+    let name = test.submit(Behavior::Chatter).await;
+    let watch = test.engine.watch(&name, 1).await.expect("exists").into_stream();
     let first: Vec<_> = watch.take(2).map(|event| event.expect("no error").body).collect().await;
     assert!(matches!(first[1], EventBody::Progress(_)), "{first:?}");
-    assert_eq!(bench.engine.job(&name).await.expect("exists").state, JobState::Running);
-    bench.gate.until_waiting(1).await;
-    bench.gate.open();
-    let job = bench.ended(&name).await;
+    assert_eq!(test.engine.job(&name).await.expect("exists").state, JobState::Running);
+    test.solver.until_waiting(1).await;
+    test.solver.release();
+    let job = test.ended(&name).await;
     assert_eq!(job.progress, Some(progress(1000)), "the last one stands in the job");
     // Two states, the result, the last state; of the thousand records one, and one more for each half second.
     let seconds = job.end_time.expect("ended").duration_since(job.start_time.expect("begun")).expect("in order");
@@ -27,17 +27,17 @@ async fn the_first_progress_is_stored_while_the_job_runs_and_a_flood_is_thinned(
 
 #[tokio::test]
 async fn a_slow_watcher_gets_the_latest_weights_only() {
-    let bench = TestEngine::start(workers(1)).await;
-    let blocker = bench.submit(Script::Wait).await;
-    bench.gate.until_waiting(1).await;
-    let name = bench.submit(Script::Weights).await;
-    let mut watch = bench.engine.watch(&name, 0).await.expect("exists");
-    bench.engine.cancel(&blocker).await.expect("exists");
-    bench.gate.until_waiting(2).await;
-    let mut late = bench.engine.watch(&name, 0).await.expect("exists");
+    let test = TestEngine::start(workers(1)).await;
+    let blocker = test.submit(Behavior::Wait).await;
+    test.solver.until_waiting(1).await;
+    let name = test.submit(Behavior::Weights).await;
+    let mut watch = test.engine.watch(&name, 0).await.expect("exists");
+    test.engine.cancel(&blocker).await.expect("exists");
+    test.solver.until_waiting(2).await;
+    let mut late = test.engine.watch(&name, 0).await.expect("exists");
     let mut events = up_to_weights(&mut watch).await;
     up_to_weights(&mut late).await;
-    bench.gate.open();
+    test.solver.release();
     events.extend(rest(&mut watch).await);
     assert_contiguous(&events, 1);
     assert_eq!(events.iter().filter(|event| event.sequence.is_none()).count(), 1, "each is told once");
@@ -59,11 +59,11 @@ async fn up_to_weights(watch: &mut crate::engine::Watch) -> Vec<JobEvent> {
 
 #[tokio::test]
 async fn a_watch_of_an_ended_job_replays_and_ends() {
-    let bench = TestEngine::start(workers(1)).await;
-    let name = bench.submit(Script::Succeed).await;
-    let last = bench.ended(&name).await.last_sequence;
+    let test = TestEngine::start(workers(1)).await;
+    let name = test.submit(Behavior::Succeed).await;
+    let last = test.ended(&name).await.last_sequence;
     for after in 0..=last {
-        let mut watch = bench.engine.watch(&name, after).await.expect("exists");
+        let mut watch = test.engine.watch(&name, after).await.expect("exists");
         let events = rest(&mut watch).await;
         assert_eq!(events.len() as u64, last - after);
         assert_contiguous(&events, after + 1);
@@ -73,40 +73,40 @@ async fn a_watch_of_an_ended_job_replays_and_ends() {
 
 #[tokio::test]
 async fn a_watch_goes_on_after_an_earlier_end_and_ends_with_the_last() {
-    let bench = TestEngine::start(workers(1)).await;
-    let name = bench.submit(Script::Fail).await;
+    let test = TestEngine::start(workers(1)).await;
+    let name = test.submit(Behavior::Fail).await;
     let batch = u64::from(crate::engine::watch::READ_AHEAD);
-    let mut ends = vec![bench.ended(&name).await.last_sequence];
+    let mut ends = vec![test.ended(&name).await.last_sequence];
     while ends[ends.len() - 1] < batch + 10 {
-        assert_eq!(bench.engine.retry(&name, None).await.expect("has failed").state, JobState::Queued);
-        ends.push(bench.ended(&name).await.last_sequence);
+        assert_eq!(test.engine.retry(&name, None).await.expect("has failed").state, JobState::Queued);
+        ends.push(test.ended(&name).await.last_sequence);
     }
     let last = ends[ends.len() - 1];
     // From the first, and so that each end in turn is the last event that is read at once.
     for after in ends.iter().filter_map(|end| end.checked_sub(batch)).chain([0]) {
-        let mut watch = bench.engine.watch(&name, after).await.expect("exists");
+        let mut watch = test.engine.watch(&name, after).await.expect("exists");
         let events = rest(&mut watch).await;
         assert_contiguous(&events, after + 1);
         assert_eq!(events.len() as u64, last - after);
     }
-    let told = rest(&mut bench.engine.watch(&name, 0).await.expect("exists")).await;
+    let told = rest(&mut test.engine.watch(&name, 0).await.expect("exists")).await;
     assert_eq!(told.iter().filter(|event| terminal(event).is_some()).count(), ends.len());
     // One that was opened at the last end sees nothing of a retry that comes later.
-    let mut ended = bench.engine.watch(&name, last).await.expect("exists");
-    bench.engine.retry(&name, None).await.expect("has failed");
+    let mut ended = test.engine.watch(&name, last).await.expect("exists");
+    test.engine.retry(&name, None).await.expect("has failed");
     assert!(ended.next().await.is_none());
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn watchers_that_come_and_go_miss_and_repeat_nothing() {
     const EVENTS: u32 = 300;
-    let bench = TestEngine::start(workers(1)).await;
-    let name = bench.submit(Script::Wait).await;
-    bench.gate.until_waiting(1).await;
+    let test = TestEngine::start(workers(1)).await;
+    let name = test.submit(Behavior::Wait).await;
+    test.solver.until_waiting(1).await;
     let lease = Lease { name: name.clone(), attempt: 1 };
     let watchers: Vec<_> = (0..16_u64)
         .map(|number| {
-            let (engine, name) = (bench.engine.clone(), name.clone());
+            let (engine, name) = (test.engine.clone(), name.clone());
             tokio::spawn(async move {
                 // Each hangs up and comes back after another number of events.
                 let mut events: Vec<JobEvent> = Vec::new();
@@ -125,11 +125,11 @@ async fn watchers_that_come_and_go_miss_and_repeat_nothing() {
         .collect();
     for iteration in 0..EVENTS {
         // Through the store and the notifier, as the engine does, only faster.
-        bench.store.record(&lease, &progress(iteration), SystemTime::now()).await.expect("holds");
-        bench.engine.inner.notifier.wake(&name);
+        test.store.record(&lease, &progress(iteration), SystemTime::now()).await.expect("holds");
+        test.engine.inner.notifier.wake(&name);
     }
-    bench.gate.open();
-    let last = bench.ended(&name).await.last_sequence;
+    test.solver.release();
+    let last = test.ended(&name).await.last_sequence;
     assert!(last > u64::from(EVENTS));
     for watcher in futures_util::future::join_all(watchers).await {
         let events = watcher.expect("no panic");
@@ -141,14 +141,14 @@ async fn watchers_that_come_and_go_miss_and_repeat_nothing() {
 
 #[tokio::test]
 async fn a_watcher_that_leaves_is_forgotten_and_cancels_nothing() {
-    let bench = TestEngine::start(workers(1)).await;
-    let name = bench.submit(Script::Wait).await;
-    bench.gate.until_waiting(1).await;
-    let watches = futures_util::future::join_all((0..10).map(|_| bench.engine.watch(&name, 0))).await;
-    assert_eq!(bench.engine.inner.notifier.channel_count(), 1);
+    let test = TestEngine::start(workers(1)).await;
+    let name = test.submit(Behavior::Wait).await;
+    test.solver.until_waiting(1).await;
+    let watches = futures_util::future::join_all((0..10).map(|_| test.engine.watch(&name, 0))).await;
+    assert_eq!(test.engine.inner.notifier.channel_count(), 1);
     drop(watches);
-    assert_eq!(bench.engine.job(&name).await.expect("exists").state, JobState::Running);
-    bench.gate.open();
-    assert_eq!(bench.ended(&name).await.state, JobState::Succeeded);
-    eventually(|| async { (bench.engine.inner.notifier.channel_count() == 0).then_some(()) }).await;
+    assert_eq!(test.engine.job(&name).await.expect("exists").state, JobState::Running);
+    test.solver.release();
+    assert_eq!(test.ended(&name).await.state, JobState::Succeeded);
+    eventually(|| async { (test.engine.inner.notifier.channel_count() == 0).then_some(()) }).await;
 }

@@ -3,7 +3,7 @@
 use tokio::runtime::Builder;
 
 use super::client::{Clients, Known, request};
-use super::server::Behavior;
+use super::server::JobBehavior;
 use super::{MAX_ATTEMPTS, MAX_JOBS, beginning};
 use crate::domain::job::{EventBody, Job, JobEvent, JobName, JobState};
 use crate::store::simulated::Cluster;
@@ -83,11 +83,11 @@ fn terminal(event: &JobEvent) -> Option<JobState> {
 /// The end is one that the job can come to, and a result is its own.
 async fn came_right(store: &dyn Store, job: &Job) -> Result<(), String> {
     let number = job.name.job.trim_start_matches("job-").parse().map_err(|_| "a foreign job".to_owned())?;
-    let behavior = Behavior::of(request(number).settings.seed);
+    let behavior = JobBehavior::of(request(number).settings.seed);
     let reason = job.failure.as_ref().map(|failure| failure.reason.as_str());
     match job.state {
         JobState::Succeeded => {
-            ensure!(behavior == Behavior::Succeed, "a job that cannot succeed has");
+            ensure!(behavior == JobBehavior::Succeed, "a job that cannot succeed has");
             let result = store.result(&job.name).await.map_err(|error| error.to_string())?;
             let result = result.ok_or("no result")?;
             ensure!(result.is_intact() && result.bytes == result_of(&job.name), "another job's result");
@@ -96,7 +96,7 @@ async fn came_right(store: &dyn Store, job: &Job) -> Result<(), String> {
             let lost = job.failure.as_ref().map_or(0, |failure| failure.attempts.len());
             ensure!(lost >= MAX_ATTEMPTS as usize, "given up after {lost} attempts");
         }
-        JobState::Failed => ensure!(behavior == Behavior::Fail, "it failed by {reason:?}"),
+        JobState::Failed => ensure!(behavior == JobBehavior::Fail, "it failed by {reason:?}"),
         JobState::Cancelled => {}
         state => return Err(format!("it is {}", state.name())),
     }

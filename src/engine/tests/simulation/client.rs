@@ -31,7 +31,7 @@ pub(super) struct Known {
 
 /// What all clients together know.
 #[derive(Debug, Default)]
-pub(super) struct Ledger {
+pub(super) struct History {
     /// Requests that were sent; the answer may be lost.
     pub sent: u64,
     /// The jobs that were acknowledged.
@@ -39,7 +39,7 @@ pub(super) struct Ledger {
     violation: Option<String>,
 }
 
-impl Ledger {
+impl History {
     fn violated(&mut self, what: String) {
         self.violation.get_or_insert(what);
     }
@@ -48,59 +48,59 @@ impl Ledger {
 /// All clients.
 pub(super) struct Clients {
     rng: ChaCha8Rng,
-    ledger: Arc<Mutex<Ledger>>,
+    history: Arc<Mutex<History>>,
 }
 
-fn locked(ledger: &Mutex<Ledger>) -> MutexGuard<'_, Ledger> {
-    ledger.lock().unwrap_or_else(PoisonError::into_inner)
+fn locked(history: &Mutex<History>) -> MutexGuard<'_, History> {
+    history.lock().unwrap_or_else(PoisonError::into_inner)
 }
 
 impl Clients {
     pub(super) fn new(seed: u64) -> Self {
-        Self { rng: ChaCha8Rng::seed_from_u64(seed), ledger: Arc::default() }
+        Self { rng: ChaCha8Rng::seed_from_u64(seed), history: Arc::default() }
     }
 
     /// The jobs that were acknowledged, and the number of requests that were sent.
     pub(super) fn known(&self) -> (BTreeMap<JobName, Known>, u64) {
-        let ledger = self.ledger();
-        (ledger.jobs.clone(), ledger.sent)
+        let history = self.history();
+        (history.jobs.clone(), history.sent)
     }
 
-    fn ledger(&self) -> MutexGuard<'_, Ledger> {
-        locked(&self.ledger)
+    fn history(&self) -> MutexGuard<'_, History> {
+        locked(&self.history)
     }
 
     /// What a client was told that must not be.
     pub(super) fn violation(&self) -> Option<String> {
-        self.ledger().violation.clone()
+        self.history().violation.clone()
     }
 
     /// Whether the end of every job was seen.
     pub(super) fn all_is_seen(&self) -> bool {
-        self.ledger().jobs.values().all(|known| known.end.is_some())
+        self.history().jobs.values().all(|known| known.end.is_some())
     }
 
     /// Someone calls a server.
     pub(super) fn call(&mut self, server: &Server) {
-        let ledger = self.ledger.clone();
-        let known = locked(&ledger).jobs.keys().cloned().choose(&mut self.rng);
+        let history = self.history.clone();
+        let known = locked(&history).jobs.keys().cloned().choose(&mut self.rng);
         match (self.rng.random_range(0..10), known) {
-            (0..=1, Some(name)) => server.spawn(|engine| watch(engine, name, ledger)),
-            (2, Some(name)) => server.spawn(|engine| cancel(engine, name, ledger)),
-            (3, Some(name)) => server.spawn(|engine| delete(engine, name, ledger)),
+            (0..=1, Some(name)) => server.spawn(|engine| watch(engine, name, history)),
+            (2, Some(name)) => server.spawn(|engine| cancel(engine, name, history)),
+            (3, Some(name)) => server.spawn(|engine| delete(engine, name, history)),
             _ => {
-                let sent = self.ledger().sent;
+                let sent = self.history().sent;
                 // A new request, or one that was sent before.
                 let number = self.rng.random_range(0..=sent).min(MOST_REQUESTS - 1);
                 let number = if self.rng.random_bool(0.7) { sent.min(MOST_REQUESTS - 1) } else { number };
-                let mut known = self.ledger();
+                let mut known = self.history();
                 known.sent = sent.max(number + 1);
                 // One whose job is deleted would be another job.
                 if known.jobs.iter().any(|(name, known)| known.deleted && name.job == format!("job-{number}")) {
                     return;
                 }
                 drop(known);
-                server.spawn(|engine| submit(engine, number, ledger));
+                server.spawn(|engine| submit(engine, number, history));
             }
         }
     }
@@ -108,10 +108,10 @@ impl Clients {
     /// Everyone who waits for the end of a job goes on with that.
     pub(super) fn watch_all(&mut self, server: &Server) {
         let open: Vec<JobName> =
-            self.ledger().jobs.iter().filter(|(_, known)| known.end.is_none()).map(|(name, _)| name.clone()).collect();
+            self.history().jobs.iter().filter(|(_, known)| known.end.is_none()).map(|(name, _)| name.clone()).collect();
         for name in open {
-            let ledger = self.ledger.clone();
-            server.spawn(|engine| watch(engine, name, ledger));
+            let history = self.history.clone();
+            server.spawn(|engine| watch(engine, name, history));
         }
     }
 }
@@ -132,51 +132,51 @@ fn is_failure(error: &Error) -> bool {
     matches!(error, Error::Unavailable(_) | Error::NoSpace(_) | Error::Draining)
 }
 
-async fn submit(engine: Engine, number: u64, ledger: Arc<Mutex<Ledger>>) {
+async fn submit(engine: Engine, number: u64, history: Arc<Mutex<History>>) {
     let answer = engine.submit(request(number)).await;
-    let mut ledger = locked(&ledger);
+    let mut history = locked(&history);
     match answer {
         Ok(job) => {
             if job.name.job != format!("job-{number}") {
-                ledger.violated(format!("request {number} is {}", job.name));
+                history.violated(format!("request {number} is {}", job.name));
             }
-            ledger.jobs.entry(job.name).or_default();
+            history.jobs.entry(job.name).or_default();
         }
         Err(Error::QueueFull { .. }) => {}
         Err(error) if is_failure(&error) => {}
-        Err(error) => ledger.violated(format!("request {number}: {error}")),
+        Err(error) => history.violated(format!("request {number}: {error}")),
     }
 }
 
-async fn cancel(engine: Engine, name: JobName, ledger: Arc<Mutex<Ledger>>) {
+async fn cancel(engine: Engine, name: JobName, history: Arc<Mutex<History>>) {
     match engine.cancel(&name).await {
         Ok(_) => {}
         Err(error) if is_failure(&error) => {}
-        Err(Error::NotFound(_)) if locked(&ledger).jobs.get(&name).is_none_or(|known| known.deleted) => {}
-        Err(error) => locked(&ledger).violated(format!("cancel of {name}: {error}")),
+        Err(Error::NotFound(_)) if locked(&history).jobs.get(&name).is_none_or(|known| known.deleted) => {}
+        Err(error) => locked(&history).violated(format!("cancel of {name}: {error}")),
     }
 }
 
-async fn delete(engine: Engine, name: JobName, ledger: Arc<Mutex<Ledger>>) {
+async fn delete(engine: Engine, name: JobName, history: Arc<Mutex<History>>) {
     // Before: whether an answer that is lost was a yes is not known.
-    let Some(known) = locked(&ledger).jobs.get(&name).cloned() else { return };
+    let Some(known) = locked(&history).jobs.get(&name).cloned() else { return };
     if known.end.is_none() {
         return;
     }
-    if let Some(known) = locked(&ledger).jobs.get_mut(&name) {
+    if let Some(known) = locked(&history).jobs.get_mut(&name) {
         known.deleted = true;
     }
     match engine.delete(&name, None).await {
         // A request that was on its way for long has made the job anew.
         Ok(()) | Err(Error::NotFound(_) | Error::NotEnded(_)) => {}
         Err(error) if is_failure(&error) => {}
-        Err(error) => locked(&ledger).violated(format!("delete of {name}: {error}")),
+        Err(error) => locked(&history).violated(format!("delete of {name}: {error}")),
     }
 }
 
 /// Follows a job from the last event that was seen.
-async fn watch(engine: Engine, name: JobName, ledger: Arc<Mutex<Ledger>>) {
-    let after = match locked(&ledger).jobs.get_mut(&name) {
+async fn watch(engine: Engine, name: JobName, history: Arc<Mutex<History>>) {
+    let after = match locked(&history).jobs.get_mut(&name) {
         Some(known) if !known.watched && known.end.is_none() => {
             known.watched = true;
             known.after
@@ -184,28 +184,28 @@ async fn watch(engine: Engine, name: JobName, ledger: Arc<Mutex<Ledger>>) {
         _ => return,
     };
     // Also where the server dies in between.
-    let _watched = Watched { name: name.clone(), ledger: ledger.clone() };
+    let _watched = Watched { name: name.clone(), history: history.clone() };
     let mut watch = match engine.watch(&name, after).await {
         Ok(watch) => watch,
         Err(error) if is_failure(&error) => return,
-        Err(error) => return locked(&ledger).violated(format!("watch of {name} after {after}: {error}")),
+        Err(error) => return locked(&history).violated(format!("watch of {name} after {after}: {error}")),
     };
     while let Some(event) = watch.next().await {
-        let mut ledger = locked(&ledger);
+        let mut history = locked(&history);
         let event = match event {
             Ok(event) => event,
             Err(error) if is_failure(&error) => return,
-            Err(error) => return ledger.violated(format!("events of {name}: {error}")),
+            Err(error) => return history.violated(format!("events of {name}: {error}")),
         };
         let Some(sequence) = event.sequence else { continue };
-        let Some(known) = ledger.jobs.get_mut(&name) else { return };
+        let Some(known) = history.jobs.get_mut(&name) else { return };
         let (before, end) = (known.after, known.end);
         known.after = sequence;
         if let EventBody::State { state, .. } = event.body {
             known.end = Some(state).filter(|state| state.is_terminal());
         }
         if sequence != before + 1 || end.is_some() {
-            ledger.violated(format!("{name}: event {sequence} came after {before} and the end {end:?}"));
+            history.violated(format!("{name}: event {sequence} came after {before} and the end {end:?}"));
         }
     }
 }
@@ -213,12 +213,12 @@ async fn watch(engine: Engine, name: JobName, ledger: Arc<Mutex<Ledger>>) {
 /// Notes when nobody follows a job any more.
 struct Watched {
     name: JobName,
-    ledger: Arc<Mutex<Ledger>>,
+    history: Arc<Mutex<History>>,
 }
 
 impl Drop for Watched {
     fn drop(&mut self) {
-        if let Some(known) = locked(&self.ledger).jobs.get_mut(&self.name) {
+        if let Some(known) = locked(&self.history).jobs.get_mut(&self.name) {
             known.watched = false;
         }
     }

@@ -19,14 +19,14 @@ use crate::store::simulated::{Faults, Link, Simulated};
 
 /// What becomes of a job, by its settings' seed.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(super) enum Behavior {
+pub(super) enum JobBehavior {
     Succeed,
     Fail,
     /// The process dies of it.
     Kill,
 }
 
-impl Behavior {
+impl JobBehavior {
     pub(super) fn of(seed: u64) -> Self {
         match seed % 10 {
             0 => Self::Fail,
@@ -150,7 +150,7 @@ impl Server {
 async fn work(mut inbox: mpsc::Receiver<Assigned>, dead: Arc<AtomicBool>) {
     while let Some(assignment) = inbox.recv().await {
         let seed = assignment.settings().seed;
-        let step = Behavior::duration(seed) / 4;
+        let step = JobBehavior::duration(seed) / 4;
         let Some(mut running) = assignment.begin() else { continue };
         for iteration in 1..=4 {
             sleep(step).await;
@@ -159,13 +159,13 @@ async fn work(mut inbox: mpsc::Receiver<Assigned>, dead: Arc<AtomicBool>) {
             }
             running.report(&progress(iteration));
         }
-        match Behavior::of(seed) {
-            Behavior::Succeed => {
+        match JobBehavior::of(seed) {
+            JobBehavior::Succeed => {
                 let result = result_of(running.name());
                 running.succeed(&solution(&input(), 1), result);
             }
-            Behavior::Fail => running.fail(),
-            Behavior::Kill => {
+            JobBehavior::Fail => running.fail(),
+            JobBehavior::Kill => {
                 dead.store(true, Ordering::Relaxed);
                 std::future::pending::<()>().await;
             }
