@@ -50,7 +50,7 @@ pub fn json(text: Vec<u8>, permit: Permit) -> Answer {
 /// A stream of messages as server-sent events; each has its number as id, and a stream that breaks off ends with an
 /// event `status`.
 pub fn events(descriptor: MessageDescriptor, messages: Streaming<Bytes>) -> Answer {
-    let told = stream::unfold(Some(messages), move |messages| {
+    let events = stream::unfold(Some(messages), move |messages| {
         let descriptor = descriptor.clone();
         async move {
             let mut messages = messages?;
@@ -65,7 +65,7 @@ pub fn events(descriptor: MessageDescriptor, messages: Streaming<Bytes>) -> Answ
             Some((Ok::<_, Infallible>(event), rest))
         }
     });
-    sse(told)
+    sse(events)
 }
 
 fn sse(events: impl Stream<Item = Result<Event, Infallible>> + Send + 'static) -> Answer {
@@ -180,10 +180,10 @@ fn http_code(code: Code) -> StatusCode {
 /// `{"error": {...}}` with the code of HTTP, the message, the name of the code and the details (AIP-193).
 fn error_body(status: &Status, code: StatusCode) -> Value {
     let details = status.get_error_details();
-    let mut told = Vec::new();
+    let mut encoded = Vec::new();
     if let Some(info) = details.error_info() {
         let metadata: Map<_, _> = info.metadata.iter().map(|(key, value)| (key.clone(), json!(value))).collect();
-        told.push(json!({
+        encoded.push(json!({
             "@type": "type.googleapis.com/google.rpc.ErrorInfo",
             "reason": info.reason, "domain": info.domain, "metadata": metadata,
         }));
@@ -191,14 +191,14 @@ fn error_body(status: &Status, code: StatusCode) -> Value {
     if let Some(request) = details.bad_request() {
         let violation = |violation: &tonic_types::FieldViolation| json!({"field": violation.field, "description": violation.description});
         let violations: Vec<_> = request.field_violations.iter().map(violation).collect();
-        told.push(json!({"@type": "type.googleapis.com/google.rpc.BadRequest", "fieldViolations": violations}));
+        encoded.push(json!({"@type": "type.googleapis.com/google.rpc.BadRequest", "fieldViolations": violations}));
     }
     if let Some(delay) = details.retry_info().and_then(|retry| retry.retry_delay) {
         let delay = format!("{}s", delay.as_secs_f64());
-        told.push(json!({"@type": "type.googleapis.com/google.rpc.RetryInfo", "retryDelay": delay}));
+        encoded.push(json!({"@type": "type.googleapis.com/google.rpc.RetryInfo", "retryDelay": delay}));
     }
     if let Some(resource) = details.resource_info() {
-        told.push(json!({
+        encoded.push(json!({
             "@type": "type.googleapis.com/google.rpc.ResourceInfo",
             "resourceType": resource.resource_type, "resourceName": resource.resource_name,
             "owner": resource.owner, "description": resource.description,
@@ -208,6 +208,6 @@ fn error_body(status: &Status, code: StatusCode) -> Value {
         "code": code.as_u16(),
         "message": status.message(),
         "status": code_name(status.code()),
-        "details": told,
+        "details": encoded,
     }})
 }

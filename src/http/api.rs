@@ -26,7 +26,7 @@ use crate::domain::Violation;
 use crate::domain::job::JobState;
 use crate::rpc::convert::enums::Twin;
 use crate::rpc::inflight::Permit;
-use crate::rpc::listener::Introduction;
+use crate::rpc::listener::ConnectionInfo;
 use crate::rpc::proto::job_service_client::JobServiceClient;
 use crate::rpc::server::Gateway;
 use crate::rpc::{proto, status};
@@ -76,11 +76,11 @@ impl Api {
         Ok(Self { routes, openapi, gateway, options, input_data, input })
     }
 
-    /// The answer to a request; `introduction` is its connection's. That to HEAD is that to GET: hyper leaves out the
-    /// body.
-    pub async fn answer(self: &Arc<Self>, introduction: Introduction, request: Request) -> Answer {
+    /// The answer to a request; `connection_info` is that of its connection. That to HEAD is that to GET: hyper leaves
+    /// out the body.
+    pub async fn answer(self: &Arc<Self>, connection_info: ConnectionInfo, request: Request) -> Answer {
         let origin = Origin::of(request.headers(), &self.options.allowed_origins);
-        let answer = self.answer_or_refuse(&origin, introduction, request).await;
+        let answer = self.answer_or_refuse(&origin, connection_info, request).await;
         let mut answer = answer.unwrap_or_else(|refused| *refused);
         if let Origin::Allowed(origin) = origin {
             origin::admit(&mut answer, origin);
@@ -91,29 +91,29 @@ impl Api {
     async fn answer_or_refuse(
         self: &Arc<Self>,
         origin: &Origin,
-        introduction: Introduction,
+        connection_info: ConnectionInfo,
         request: Request,
     ) -> Result<Answer, Box<Answer>> {
         if *origin == Origin::Other {
             let text = "a page of another site may not call this API: http.allowed_origins names those that may";
-            return Err(self.forbid(HttpRefusal::Origin, text, &introduction));
+            return Err(self.forbid(HttpRefusal::Origin, text, &connection_info));
         }
         if !self.gateway.asks_for_keys() && !self.is_own_host(request.headers()) {
             let text = "the request is for a host that this server does not know: http.hosts names those that it has";
-            return Err(self.forbid(HttpRefusal::Host, text, &introduction));
+            return Err(self.forbid(HttpRefusal::Host, text, &connection_info));
         }
         if *origin != Origin::Own && request.method() == Method::OPTIONS {
             return Ok(origin::preflight());
         }
         if grpc_web::is_call(request.headers()) {
-            return Ok(grpc_web::answer(&self.gateway, introduction, request).await);
+            return Ok(grpc_web::answer(&self.gateway, connection_info, request).await);
         }
         let path = request.uri().path().to_owned();
         let verb = if request.method() == Method::HEAD { Method::GET } else { request.method().clone() };
         let mut allowed = Vec::new();
         if path == OPENAPI_PATH && self.gateway.describes {
             if verb == Method::GET {
-                self.check_key(request.headers(), &introduction)?;
+                self.check_key(request.headers(), &connection_info)?;
                 return Ok(answer::json(self.openapi.to_vec(), self.gateway.permit()));
             }
             allowed.push(Method::GET);
@@ -126,12 +126,12 @@ impl Api {
         }
         if let Some(parent) = upload::parent(&path) {
             if verb == Method::POST {
-                return upload::answer(self, introduction, parent, request).await;
+                return upload::answer(self, connection_info, parent, request).await;
             }
             allowed.push(Method::POST);
         }
         match route::find(&self.routes, &verb, &path) {
-            Found::Route(route, fields) => return self.call(route, fields, introduction, request).await,
+            Found::Route(route, fields) => return self.call(route, fields, connection_info, request).await,
             Found::OtherVerbs(verbs) => allowed.extend(verbs),
             Found::Nothing => {}
         }
@@ -148,8 +148,8 @@ impl Api {
     }
 
     /// Whether the request has a key, where one is asked for.
-    pub(super) fn check_key(&self, headers: &HeaderMap, introduction: &Introduction) -> Result<(), Box<Answer>> {
-        let checked = self.gateway.check_key(headers, introduction);
+    pub(super) fn check_key(&self, headers: &HeaderMap, connection_info: &ConnectionInfo) -> Result<(), Box<Answer>> {
+        let checked = self.gateway.check_key(headers, connection_info);
         checked.map_err(|status| answer::uncalled(HttpRefusal::Unauthenticated, &status))
     }
 
@@ -157,11 +157,11 @@ impl Api {
         self: &Arc<Self>,
         route: &Route,
         fields: Vec<(&str, String)>,
-        introduction: Introduction,
+        connection_info: ConnectionInfo,
         request: Request,
     ) -> Result<Answer, Box<Answer>> {
         let (head, body) = request.into_parts();
-        self.check_key(&head.headers, &introduction)?;
+        self.check_key(&head.headers, &connection_info)?;
         let permit = self.gateway.permit();
         let descriptor = route.method.input();
         let query = head.uri.query().unwrap_or_default();
@@ -193,9 +193,9 @@ impl Api {
         if let Some(after) = message.get_field_by_name(after).and_then(|number| number.as_u64()).filter(|&n| n > 0)
             && let Some(name) = message.get_field_by_name("name").and_then(|name| name.as_str().map(str::to_owned))
         {
-            let asked = call(&head.headers, introduction.clone(), permit.clone(), proto::GetJobRequest { name });
+            let asked = call(&head.headers, connection_info.clone(), permit.clone(), proto::GetJobRequest { name });
             let job = JobServiceClient::new(self.gateway.service.clone()).get_job(asked).await.map_err(failed)?;
-            if is_told(job.get_ref(), after) {
+            if is_complete(job.get_ref(), after) {
                 return Ok(answer::nothing_more());
             }
         }
@@ -203,7 +203,7 @@ impl Api {
         let encoded = in_background(length, encode).await.map_err(failed)?;
         // From here on it is the call's message, which is charged as it is read.
         permit.hold(0).map_err(failed)?;
-        let call = call(&head.headers, introduction, permit.clone(), encoded);
+        let call = call(&head.headers, connection_info, permit.clone(), encoded);
         let mut grpc = Grpc::new(self.gateway.service.clone()).max_decoding_message_size(usize::MAX);
         // Never fails: the services are always ready.
         let _ = grpc.ready().await;
@@ -219,9 +219,9 @@ impl Api {
     }
 
     /// Refuses a request for where it comes from or goes to, and writes that down.
-    fn forbid(&self, refusal: HttpRefusal, text: &str, introduction: &Introduction) -> Box<Answer> {
+    fn forbid(&self, refusal: HttpRefusal, text: &str, connection_info: &ConnectionInfo) -> Box<Answer> {
         let status = answer::status_of(refusal, text);
-        self.gateway.tell_refused(&status, introduction);
+        self.gateway.log_refused(&status, connection_info);
         answer::uncalled(refusal, &status)
     }
 
@@ -291,7 +291,7 @@ impl Api {
 /// A call with what the request says of its caller.
 pub(super) fn call<T>(
     headers: &HeaderMap,
-    introduction: Introduction,
+    connection_info: ConnectionInfo,
     permit: Permit,
     message: T,
 ) -> tonic::Request<T> {
@@ -303,7 +303,7 @@ pub(super) fn call<T>(
     }
     let mut call = tonic::Request::new(message);
     *call.metadata_mut() = MetadataMap::from_headers(passed);
-    call.extensions_mut().insert(introduction);
+    call.extensions_mut().insert(connection_info);
     call.extensions_mut().insert(permit);
     call
 }
@@ -319,7 +319,7 @@ pub(super) fn invalid(field: &str, description: impl Into<String>) -> Box<Answer
 
 /// Whether a job has ended and had its last event by then. A browser's `EventSource` asks again whenever its stream
 /// ends, until it is told that there is nothing more.
-fn is_told(job: &proto::Job, after_sequence: u64) -> bool {
+fn is_complete(job: &proto::Job, after_sequence: u64) -> bool {
     JobState::required(job.state, "state").is_ok_and(JobState::is_terminal) && job.last_sequence <= after_sequence
 }
 

@@ -9,7 +9,7 @@ use tonic_web::GrpcWebLayer;
 use tower::{Layer, Service};
 
 use super::answer::Answer;
-use crate::rpc::listener::Introduction;
+use crate::rpc::listener::ConnectionInfo;
 use crate::rpc::server::Gateway;
 
 /// How the content type of such a call begins; `-text` and `+proto` may follow.
@@ -21,9 +21,9 @@ pub fn is_call(headers: &HeaderMap) -> bool {
     kind.is_some_and(|kind| kind.starts_with(CONTENT_TYPE))
 }
 
-/// Answers a call within the process, behind the layers of every call; `introduction` is its connection's.
-pub async fn answer(gateway: &Gateway, introduction: Introduction, mut request: Request) -> Answer {
-    request.extensions_mut().insert(introduction);
+/// Answers a call within the process, behind the layers of every call; `connection_info` is that of its connection.
+pub async fn answer(gateway: &Gateway, connection_info: ConnectionInfo, mut request: Request) -> Answer {
+    request.extensions_mut().insert(connection_info);
     let mut service = GrpcWebLayer::new().layer(gateway.service.clone());
     // Never fails: the services are always ready.
     let _ = poll_fn(|context| Service::<Request>::poll_ready(&mut service, context)).await;

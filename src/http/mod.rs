@@ -164,10 +164,10 @@ async fn serve(mut incoming: Incoming, api: Arc<Api>, stop: CancellationToken) {
             Some(_) = connections.join_next() => continue,
             () = stop.cancelled() => break,
         };
-        let (introduction, api) = (connection.introduction(), api.clone());
+        let (connection_info, api) = (connection.connection_info(), api.clone());
         let answer = service_fn(move |request: hyper::Request<hyper::body::Incoming>| {
-            let (introduction, api) = (introduction.clone(), api.clone());
-            async move { Ok::<_, Infallible>(api.answer(introduction, request.map(Body::new)).await) }
+            let (connection_info, api) = (connection_info.clone(), api.clone());
+            async move { Ok::<_, Infallible>(api.answer(connection_info, request.map(Body::new)).await) }
         });
         let io = TokioIo::new(silence::Connection::new(connection, SILENCE));
         let served = http1::Builder::new()

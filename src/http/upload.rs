@@ -15,7 +15,7 @@ use super::answer::{self, Answer};
 use super::api::{Api, call, failed, in_background, invalid};
 use crate::rpc::convert::size_to_wire;
 use crate::rpc::inputs::MAX_CHUNK_BYTES;
-use crate::rpc::listener::Introduction;
+use crate::rpc::listener::ConnectionInfo;
 use crate::rpc::proto::input_service_client::InputServiceClient;
 use crate::rpc::proto::upload_input_request::Message;
 use crate::rpc::proto::{self, UploadInputRequest};
@@ -38,12 +38,12 @@ pub fn parent(path: &str) -> Option<String> {
 /// beforehand.
 pub async fn answer(
     api: &Arc<Api>,
-    introduction: Introduction,
+    connection_info: ConnectionInfo,
     parent: String,
     request: Request,
 ) -> Result<Answer, Box<Answer>> {
     let (head, body) = request.into_parts();
-    api.check_key(&head.headers, &introduction)?;
+    api.check_key(&head.headers, &connection_info)?;
     let mut upload_id = None;
     for (name, value) in form_urlencoded::parse(head.uri.query().unwrap_or_default().as_bytes()) {
         if name != UPLOAD_ID {
@@ -70,7 +70,7 @@ pub async fn answer(
     };
     let mut client = InputServiceClient::new(api.gateway.service.clone());
     let asked = proto::GetUploadStatusRequest { parent: start.parent.clone(), upload_id: start.upload_id.clone() };
-    let asked = call(&head.headers, introduction.clone(), permit.clone(), asked);
+    let asked = call(&head.headers, connection_info.clone(), permit.clone(), asked);
     // What an upload that broke off has left is kept: the body is passed over that far.
     let committed = match client.get_upload_status(asked).await {
         Ok(status) => u64::try_from(status.into_inner().committed_bytes).unwrap_or(0),
@@ -79,7 +79,7 @@ pub async fn answer(
     };
     let messages = messages(start, committed, body.into_data_stream());
     let uploaded =
-        client.upload_input(call(&head.headers, introduction, permit.clone(), messages)).await.map_err(failed)?;
+        client.upload_input(call(&head.headers, connection_info, permit.clone(), messages)).await.map_err(failed)?;
     let json = answer::message(&api.input, &uploaded.into_inner().encode_to_vec()).map_err(failed)?;
     Ok(answer::json(json, permit))
 }

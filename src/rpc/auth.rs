@@ -16,7 +16,7 @@ use tower::{Layer, Service};
 
 use super::caller::Tenant;
 use super::keys::{Grant, Hash, KeyRing};
-use super::listener::Introduction;
+use super::listener::ConnectionInfo;
 use super::meter::CallRecord;
 use super::rates::Rates;
 use super::reload::Current;
@@ -60,25 +60,25 @@ impl Authenticate {
     }
 
     /// Whose call it is, and what it hangs on.
-    fn admit(&self, headers: &HeaderMap) -> Result<(Tenant, Option<Standing>), Status> {
+    fn admit(&self, headers: &HeaderMap) -> Result<(Tenant, Option<AcceptedKey>), Status> {
         let Some(keys) = &self.keys else { return Ok((Tenant::default(), None)) };
         let key = Hash::of(bearer(headers)?);
         let mut keys = keys.clone();
         let grant = keys.borrow_and_update().grant_of_hash(&key).cloned();
         let grant = grant.ok_or_else(status::unknown_key)?;
-        Ok((Tenant::of(&grant), Some(Standing { keys, key, grant })))
+        Ok((Tenant::of(&grant), Some(AcceptedKey { keys, key, grant })))
     }
 }
 
 /// A key that was accepted, and what it stood for then.
 #[derive(Clone)]
-struct Standing {
+struct AcceptedKey {
     keys: Current<KeyRing>,
     key: Hash,
     grant: Grant,
 }
 
-impl Standing {
+impl AcceptedKey {
     /// Ends when the key does not stand for the same any more; keys that cannot change never end.
     async fn lost(mut self) {
         while self.keys.changed().await.is_ok() {
@@ -103,8 +103,8 @@ struct Watched {
 }
 
 impl Watched {
-    fn over(body: Body, standing: &Standing, is_answer: bool) -> Body {
-        Body::new(Self { body, lost: Some(Box::pin(standing.clone().lost())), is_answer })
+    fn over(body: Body, accepted: &AcceptedKey, is_answer: bool) -> Body {
+        Body::new(Self { body, lost: Some(Box::pin(accepted.clone().lost())), is_answer })
     }
 }
 
@@ -147,13 +147,13 @@ fn bearer(headers: &HeaderMap) -> Result<&str, Status> {
     if scheme.eq_ignore_ascii_case("bearer") { Ok(key.trim()) } else { Err(status::no_key()) }
 }
 
-/// Notes that someone who may call does, so that the connection may stay. What is no call of gRPC says nothing of who
-/// it is.
-fn introduce(request: &Request<Body>) {
+/// Marks the connection of someone who may call as authenticated, so that it may stay. What is no call of gRPC says
+/// nothing of who it is.
+fn mark_authenticated(request: &Request<Body>) {
     let content_type = request.headers().get(CONTENT_TYPE).and_then(|value| value.to_str().ok());
     let is_call = request.method() == Method::POST && content_type.is_some_and(|kind| kind.starts_with(GRPC));
-    if let Some(introduction) = request.extensions().get::<Introduction>().filter(|_| is_call) {
-        introduction.make();
+    if let Some(connection_info) = request.extensions().get::<ConnectionInfo>().filter(|_| is_call) {
+        connection_info.set_authenticated();
     }
 }
 
@@ -187,27 +187,27 @@ where
 
     fn call(&mut self, mut request: Request<Body>) -> Self::Future {
         if is_open(request.uri().path()) {
-            // Where keys are asked for, one who checks the server's health is still a stranger.
+            // Where keys are asked for, one who checks the server's health is still unauthenticated.
             if self.layer.keys.is_none() {
-                introduce(&request);
+                mark_authenticated(&request);
             }
             return Box::pin(self.inner.call(request));
         }
-        let (tenant, standing) = match self.layer.admit(request.headers()) {
+        let (tenant, accepted) = match self.layer.admit(request.headers()) {
             Ok(admitted) => admitted,
             Err(status) => {
                 let refusal = status.into_http();
                 return Box::pin(async { Ok(refusal) });
             }
         };
-        introduce(&request);
-        let key = standing.as_ref().map(|standing| &standing.key);
+        mark_authenticated(&request);
+        let key = accepted.as_ref().map(|accepted| &accepted.key);
         if let Some(record) = CallRecord::of(request.extensions()) {
             record.identify(tenant.id(), key.map(Hash::fingerprint));
         }
         // Without keys everyone may do everything.
         let needed = meter::scope_of(request.uri().path());
-        let checked = match standing.as_ref().is_some_and(|standing| standing.grant.scope < needed) {
+        let checked = match accepted.as_ref().is_some_and(|accepted| accepted.grant.scope < needed) {
             true => Err(status::scope_missing(needed)),
             false => self.layer.rates.call(key),
         };
@@ -219,14 +219,14 @@ where
         request.extensions_mut().insert(self.layer.rates.clone());
         // No service needs it any more, and none can let it slip.
         request.headers_mut().remove(AUTHORIZATION);
-        let Some(standing) = standing else { return Box::pin(self.inner.call(request)) };
-        let answer = self.inner.call(request.map(|body| Watched::over(body, &standing, false)));
+        let Some(accepted) = accepted else { return Box::pin(self.inner.call(request)) };
+        let answer = self.inner.call(request.map(|body| Watched::over(body, &accepted, false)));
         Box::pin(async move {
             let answer = tokio::select! {
                 answer = answer => answer?,
-                () = standing.clone().lost() => return Ok(status::withdrawn_key().into_http()),
+                () = accepted.clone().lost() => return Ok(status::withdrawn_key().into_http()),
             };
-            Ok(answer.map(|body| Watched::over(body, &standing, true)))
+            Ok(answer.map(|body| Watched::over(body, &accepted, true)))
         })
     }
 }
@@ -279,7 +279,7 @@ mod tests {
 
     #[test]
     fn without_keys_everyone_is_of_the_default_tenant() {
-        let (tenant, standing) = Authenticate::new(None, any_rate()).admit(&headers(&[])).expect("open");
-        assert!(tenant == Tenant::default() && standing.is_none());
+        let (tenant, accepted) = Authenticate::new(None, any_rate()).admit(&headers(&[])).expect("open");
+        assert!(tenant == Tenant::default() && accepted.is_none());
     }
 }

@@ -23,7 +23,7 @@ use crate::{solver, telemetry};
 
 /// How long a `Solve` may be silent before its input is complete. A dead connection is found by keep-alive long before;
 /// this is for a caller that lives and forgets.
-const INPUT_PATIENCE: Duration = Duration::from_secs(60);
+const MESSAGE_TIMEOUT: Duration = Duration::from_secs(60);
 
 /// What the transport bounds, as the server tells it.
 #[derive(Debug, Clone, Copy)]
@@ -85,9 +85,9 @@ impl Calibration {
 }
 
 async fn next(messages: &mut Streaming<proto::SolveRequest>) -> Result<Option<proto::SolveRequest>, Status> {
-    match tokio::time::timeout(INPUT_PATIENCE, messages.message()).await {
+    match tokio::time::timeout(MESSAGE_TIMEOUT, messages.message()).await {
         Ok(message) => message,
-        Err(_) => Err(status::input_stalled(INPUT_PATIENCE)),
+        Err(_) => Err(status::input_stalled(MESSAGE_TIMEOUT)),
     }
 }
 

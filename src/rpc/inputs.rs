@@ -10,7 +10,7 @@ use tracing::Instrument;
 use super::caller::Caller;
 use super::convert::{self, input, size_to_wire};
 use super::inflight::{Permit, WORKING_COPIES};
-use super::parts::{self, Parts};
+use super::upload_reader::{self, UploadReader};
 use super::{proto, status, violation};
 use crate::domain::{InputName, Limits};
 use crate::engine::{Begun, Engine, GivenUp, InputQuery, NewUpload, Upload};
@@ -26,7 +26,7 @@ pub const MAX_MESSAGE_BYTES: usize = MAX_CHUNK_BYTES + 1024;
 const WRITE_BYTES: usize = MAX_CHUNK_BYTES;
 
 /// How long a stream may be silent, as in `Solve`.
-const PATIENCE: Duration = Duration::from_secs(60);
+const MESSAGE_TIMEOUT: Duration = Duration::from_secs(60);
 
 /// Uploads that are decoded at a time, so that others are not kept waiting for the processor; more wait for their turn.
 const DECODED_AT_ONCE: usize = 2;
@@ -107,7 +107,7 @@ impl Inputs {
         let largest = self.limits.max_observations as u64 * input::OBSERVATION_BYTES;
         permit.hold(WORKING_COPIES * upload.bytes().min(largest))?;
         let length = usize::try_from(upload.bytes()).map_err(|error| status::internal(&error))?;
-        let (sender, reader) = Parts::new(length);
+        let (sender, reader) = UploadReader::new(length);
         let limits = self.limits.clone();
         let decode = super::blocking(move || {
             let mut reader = reader.begun();
@@ -116,7 +116,7 @@ impl Inputs {
             // Of bytes that are not those that were meant, nothing else is worth telling.
             Ok((found, (found == sha256).then_some(draft)))
         });
-        let (outcome, ()) = tokio::join!(decode, parts::feed(&upload, sender));
+        let (outcome, ()) = tokio::join!(decode, upload_reader::feed(&upload, sender));
         let (found, draft) = outcome?.map_err(status::from_engine)?;
         let Some(draft) = draft else {
             upload.give_up(GivenUp::WrongHash).await.map_err(status::from_engine)?;
@@ -231,9 +231,9 @@ impl Reception {
 }
 
 async fn next(messages: &mut Streaming<proto::UploadInputRequest>, permit: &Permit) -> Result<Option<Message>, Status> {
-    let message = match tokio::time::timeout(PATIENCE, messages.message()).await {
+    let message = match tokio::time::timeout(MESSAGE_TIMEOUT, messages.message()).await {
         Ok(message) => message?,
-        Err(_) => return Err(status::input_stalled(PATIENCE)),
+        Err(_) => return Err(status::input_stalled(MESSAGE_TIMEOUT)),
     };
     permit.next_message();
     match message {

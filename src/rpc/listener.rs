@@ -26,7 +26,7 @@ use tonic::transport::server::Connected;
 
 use self::refusals::Refusals;
 use self::unauthenticated::AuthDeadline;
-pub use self::unauthenticated::{AUTH_TIMEOUT, Introduction};
+pub use self::unauthenticated::{AUTH_TIMEOUT, ConnectionInfo};
 use super::reload::Current;
 use crate::telemetry::metrics;
 
@@ -56,7 +56,7 @@ const MAX_REFUSALS: usize = MAX_HANDSHAKING;
 /// call.
 const NO_SETTINGS: &[u8] = b"\0\0\0\x04\0\0\0\0\0";
 
-/// What a connection is told for which there is no room: GOAWAY (RFC 9113, section 6.8) after stream 0 with
+/// What a connection is answered for which there is no room: GOAWAY (RFC 9113, section 6.8) after stream 0 with
 /// REFUSED_STREAM. No call of it was begun, so that a client may come again: gRPC calls that UNAVAILABLE, where
 /// ENHANCE_YOUR_CALM would be RESOURCE_EXHAUSTED.
 const NO_ROOM: &[u8] = b"\0\0\x1c\x07\0\0\0\0\0\0\0\0\0\0\0\0\x07too many connections";
@@ -135,7 +135,7 @@ struct ConnectionListener {
     /// One for each connection that is being refused.
     refusal_permits: Arc<Semaphore>,
     refusal_log: Refusals,
-    handshaking: JoinSet<Result<Begun, String>>,
+    handshaking: JoinSet<Result<Established, String>>,
     oldest_first: VecDeque<AbortHandle>,
 }
 
@@ -151,19 +151,19 @@ impl ConnectionListener {
                     }
                 },
                 Some(ended) = self.handshaking.join_next() => match ended {
-                    Ok(Ok(begun)) => match self.permits.clone().try_acquire_owned() {
+                    Ok(Ok(established)) => match self.permits.clone().try_acquire_owned() {
                         Ok(permit) => {
-                            let Begun { io, early, peer } = begun;
+                            let Established { io, early, peer } = established;
                             let auth_deadline = AuthDeadline::begin(self.options.auth_timeout, peer);
                             return Connection { io, early, auth_deadline, _held: (permit, metrics::connection()) };
                         }
-                        Err(_) => self.refuse(begun),
+                        Err(_) => self.refuse(established),
                     },
                     Ok(Err(error)) => tracing::debug!(error, "a connection came to nothing"),
                     Err(error) if error.is_cancelled() => tracing::debug!("a silent connection made room for another"),
                     Err(error) => tracing::error!(%error, "a connection's task failed"),
                 },
-                count = self.refusal_log.told() => self.tell_refused(count),
+                count = self.refusal_log.next_count() => self.log_refused(count),
             }
         }
     }
@@ -185,36 +185,36 @@ impl ConnectionListener {
         let bound = self.options.timeout;
         let handshake = self.handshaking.spawn(async move {
             match tokio::time::timeout(bound, begin(connection, acceptor)).await {
-                Ok(begun) => begun.map_err(|error| error.to_string()),
+                Ok(established) => established.map_err(|error| error.to_string()),
                 Err(_) => Err(format!("silent for {} s", bound.as_secs_f64())),
             }
         });
         self.oldest_first.push_back(handshake);
     }
 
-    fn tell_refused(&self, count: u64) {
+    fn log_refused(&self, count: u64) {
         let max_connections = self.options.max_established;
         tracing::warn!(count, max_connections, "connections were refused: as many speak as may");
     }
 
-    /// Tells a connection that there is no room for it.
-    fn refuse(&mut self, begun: Begun) {
+    /// Answers a connection that there is no room for it.
+    fn refuse(&mut self, established: Established) {
         metrics::connection_refused();
         if let Some(count) = self.refusal_log.add(Instant::now()) {
-            self.tell_refused(count);
+            self.log_refused(count);
         }
         let Ok(place) = self.refusal_permits.clone().try_acquire_owned() else { return };
         let is_http_1 = self.options.protocol.is_some();
         tokio::spawn(async move {
             let _place = place;
-            let Begun { mut io, early, .. } = begun;
+            let Established { mut io, early, .. } = established;
             if is_http_1 {
-                let told = async {
+                let answering = async {
                     io.write_all(NO_ROOM_HTTP_1).await?;
                     io.shutdown().await?;
                     tokio::io::copy(&mut io, &mut tokio::io::sink()).await
                 };
-                let _ = tokio::time::timeout(REFUSAL_TIMEOUT, told).await;
+                let _ = tokio::time::timeout(REFUSAL_TIMEOUT, answering).await;
                 return;
             }
             let called = async {
@@ -222,22 +222,22 @@ impl ConnectionListener {
                 io.flush().await?;
                 if early == PREFACE[..] { first_call(&mut io).await } else { Ok(()) }
             };
-            // Whoever does not call is told all the same.
+            // Whoever does not call is answered all the same.
             let _ = tokio::time::timeout(REFUSED_CALL_TIMEOUT, called).await;
-            let told = async {
+            let answering = async {
                 io.write_all(NO_ROOM).await?;
                 io.shutdown().await?;
                 // A socket that is closed with bytes that nobody read is reset, and what it said may be lost with it.
                 tokio::io::copy(&mut io, &mut tokio::io::sink()).await
             };
             // Whoever does not listen is not waited for.
-            let _ = tokio::time::timeout(REFUSAL_TIMEOUT, told).await;
+            let _ = tokio::time::timeout(REFUSAL_TIMEOUT, answering).await;
         });
     }
 }
 
-/// Shakes hands, where there is TLS, and waits for the first words.
-async fn begin(connection: TcpStream, acceptor: Option<TlsAcceptor>) -> io::Result<Begun> {
+/// Shakes hands, where there is TLS, and waits for the first bytes.
+async fn begin(connection: TcpStream, acceptor: Option<TlsAcceptor>) -> io::Result<Established> {
     connection.set_nodelay(true)?;
     let peer = connection.peer_addr().ok();
     let mut io: Box<dyn Io> = match acceptor {
@@ -255,7 +255,7 @@ async fn begin(connection: TcpStream, acceptor: Option<TlsAcceptor>) -> io::Resu
         }
         early.extend_from_slice(&rest[..count]);
     }
-    Ok(Begun { io, early: early.into(), peer })
+    Ok(Established { io, early: early.into(), peer })
 }
 
 /// Reads what comes after the preface until a call begins, or what no server allows.
@@ -271,8 +271,8 @@ async fn first_call(io: &mut dyn Io) -> io::Result<()> {
     }
 }
 
-/// A connection that has said its first words.
-struct Begun {
+/// A connection whose handshake is done.
+struct Established {
     io: Box<dyn Io>,
     early: Bytes,
     peer: Option<SocketAddr>,
@@ -283,7 +283,7 @@ trait Io: AsyncRead + AsyncWrite + Send + Unpin {}
 
 impl<T: AsyncRead + AsyncWrite + Send + Unpin> Io for T {}
 
-/// A connection whose first words have been heard, and are said again.
+/// An established connection: what was read of it early is read again.
 pub struct Connection {
     io: Box<dyn Io>,
     early: Bytes,
@@ -294,17 +294,17 @@ pub struct Connection {
 
 impl Connection {
     /// For [`Authenticate`](super::auth::Authenticate), which knows who may call.
-    pub fn introduction(&self) -> Introduction {
-        self.auth_deadline.introduction.clone()
+    pub fn connection_info(&self) -> ConnectionInfo {
+        self.auth_deadline.connection_info.clone()
     }
 }
 
 impl Connected for Connection {
     /// For [`Authenticate`](super::auth::Authenticate), which knows who may call.
-    type ConnectInfo = Introduction;
+    type ConnectInfo = ConnectionInfo;
 
-    fn connect_info(&self) -> Introduction {
-        self.introduction()
+    fn connect_info(&self) -> ConnectionInfo {
+        self.connection_info()
     }
 }
 

@@ -1,5 +1,6 @@
 //! Counts every call by method and status code, from the request's headers to the last byte of its answer, and writes
-//! it down: a line a call in the access log, and refusals in the log, of which anyone can cause many and few are told.
+//! it down: a line a call in the access log, and refusals in the log, of which anyone can cause many and few are
+//! logged.
 
 use std::net::SocketAddr;
 use std::pin::Pin;
@@ -18,7 +19,7 @@ use tower::{Layer, Service};
 use super::auth::is_open;
 use super::caller::TRACE_PARENT;
 use super::keys::Scope::{self, Admin, Ordinary, ReadOnly};
-use super::listener::Introduction;
+use super::listener::ConnectionInfo;
 use crate::telemetry::metrics::{RpcCall, UNKNOWN_METHOD};
 use crate::telemetry::throttle::Throttle;
 use crate::telemetry::tracing::ACCESS;
@@ -76,7 +77,7 @@ pub struct CallRecord {
 }
 
 impl CallRecord {
-    /// The record of a call that came through the [`Meter`].
+    /// The record of a call that came through the [`MetricsLayer`].
     pub fn of(extensions: &Extensions) -> Option<Arc<Self>> {
         extensions.get().cloned()
     }
@@ -84,7 +85,7 @@ impl CallRecord {
     fn begin<B>(request: &Request<B>) -> Self {
         let trace_parent = request.headers().get(TRACE_PARENT).and_then(|value| value.to_str().ok());
         Self {
-            peer: request.extensions().get::<Introduction>().and_then(Introduction::peer),
+            peer: request.extensions().get::<ConnectionInfo>().and_then(ConnectionInfo::peer),
             trace: trace_parent.and_then(trace_id),
             ..Self::default()
         }
@@ -131,7 +132,7 @@ pub struct RefusalLog([Throttle; REFUSALS.len()]);
 
 impl RefusalLog {
     /// Writes it down where it is a refusal, and there is room for one more line.
-    pub fn tell(&self, status: &Status, method: &'static str, record: &CallRecord) {
+    pub fn log(&self, status: &Status, method: &'static str, record: &CallRecord) {
         let Some(kind) = REFUSALS.into_iter().position(|code| code == status.code()) else { return };
         let code = code_name(status.code());
         if self.0[kind].allows(move |count| tracing::warn!(code, count, "more refusals were left out of the log")) {
@@ -144,39 +145,39 @@ impl RefusalLog {
     }
 
     /// The same of a request that is refused before it becomes a call.
-    pub fn tell_early(&self, status: &Status, introduction: &Introduction) {
-        let record = CallRecord { peer: introduction.peer(), ..CallRecord::default() };
-        self.tell(status, UNKNOWN_METHOD, &record);
+    pub fn log_early(&self, status: &Status, connection_info: &ConnectionInfo) {
+        let record = CallRecord { peer: connection_info.peer(), ..CallRecord::default() };
+        self.log(status, UNKNOWN_METHOD, &record);
     }
 }
 
 /// The layer; goes around everything else.
 #[derive(Debug, Clone, Default)]
-pub struct Meter {
+pub struct MetricsLayer {
     pub refusals: RefusalLog,
 }
 
-impl<S> Layer<S> for Meter {
-    type Service = Metered<S>;
+impl<S> Layer<S> for MetricsLayer {
+    type Service = MetricsService<S>;
 
-    fn layer(&self, inner: S) -> Metered<S> {
-        Metered { inner, refusals: self.refusals.clone() }
+    fn layer(&self, inner: S) -> MetricsService<S> {
+        MetricsService { inner, refusals: self.refusals.clone() }
     }
 }
 
 /// A service whose calls are counted.
 #[derive(Debug, Clone)]
-pub struct Metered<S> {
+pub struct MetricsService<S> {
     inner: S,
     refusals: RefusalLog,
 }
 
-impl<S, B> Service<Request<B>> for Metered<S>
+impl<S, B> Service<Request<B>> for MetricsService<S>
 where
     S: Service<Request<B>, Response = Response<Body>>,
     S::Future: Send + 'static,
 {
-    type Response = Response<MeteredBody>;
+    type Response = Response<MetricsBody>;
     type Error = S::Error;
     type Future = Pin<Box<dyn Future<Output = Result<Self::Response, S::Error>> + Send>>;
 
@@ -205,7 +206,7 @@ where
                 }
                 None => Some(call),
             };
-            Ok(answer.map(|body| MeteredBody { body, call }))
+            Ok(answer.map(|body| MetricsBody { body, call }))
         })
     }
 }
@@ -223,7 +224,7 @@ struct OpenCall {
 impl OpenCall {
     fn end(mut self, status: &Status) {
         self.counted.code = code_name(status.code());
-        self.refusals.tell(status, self.counted.method, &self.record);
+        self.refusals.log(status, self.counted.method, &self.record);
     }
 }
 
@@ -250,12 +251,12 @@ impl Drop for OpenCall {
 }
 
 /// A body whose trailers, or whose drop, end the call.
-pub struct MeteredBody {
+pub struct MetricsBody {
     body: Body,
     call: Option<OpenCall>,
 }
 
-impl HttpBody for MeteredBody {
+impl HttpBody for MetricsBody {
     type Data = Bytes;
     type Error = Status;
 
@@ -358,7 +359,7 @@ mod tests {
             let request = Request::builder().uri("/scpsfm.v1.JobService/GetJob").body(()).expect("a request");
             let runtime = tokio::runtime::Builder::new_current_thread().build().expect("a runtime");
             runtime.block_on(async {
-                let Ok(answer) = Meter::default().layer(inner).call(request).await;
+                let Ok(answer) = MetricsLayer::default().layer(inner).call(request).await;
                 let mut body = answer.into_body();
                 for _ in 0..read {
                     std::future::poll_fn(|context| Pin::new(&mut body).poll_frame(context)).await;

@@ -8,14 +8,13 @@ pub mod calibration;
 pub mod caller;
 pub mod convert;
 pub mod disconnect;
-pub mod explain;
+pub mod error_details;
 pub mod inflight;
 pub mod inputs;
 pub mod jobs;
 pub mod keys;
 pub mod listener;
 pub mod meter;
-mod parts;
 pub mod proto;
 pub mod rates;
 pub mod reload;
@@ -23,6 +22,7 @@ pub mod server;
 pub mod status;
 pub mod submission;
 pub mod tls;
+mod upload_reader;
 
 use tonic::Status;
 

@@ -22,13 +22,13 @@ use tower::layer::util::{Identity, Stack};
 use super::admin::Admin;
 use super::auth::{Authenticate, Authenticated};
 use super::calibration::{self, Calibration};
-use super::explain::{Explain, Explained};
+use super::error_details::{ErrorDetailsLayer, ErrorDetailsService};
 use super::inflight::{Budget, Charged, Inflight, Permit};
 use super::inputs::{self, Inputs};
 use super::jobs::Jobs;
 use super::keys::{self, KeyRing};
-use super::listener::{self, Introduction};
-use super::meter::{Meter, Metered, RefusalLog};
+use super::listener::{self, ConnectionInfo};
+use super::meter::{MetricsLayer, MetricsService, RefusalLog};
 use super::proto::FILE_DESCRIPTOR_SET;
 use super::proto::admin_service_server::AdminServiceServer;
 use super::proto::calibration_service_server::CalibrationServiceServer;
@@ -41,7 +41,7 @@ use crate::domain::Limits;
 use crate::engine::{Engine, StoreState};
 use crate::telemetry::metrics::{Reloaded, locked_out};
 
-/// Services whose health is told one by one; the empty name is the server's own.
+/// Services whose health is reported one by one; the empty name is the server's own.
 const HEALTH_NAMES: [&str; 5] =
     ["", "scpsfm.v1.CalibrationService", "scpsfm.v1.JobService", "scpsfm.v1.InputService", "scpsfm.v1.AdminService"];
 
@@ -173,7 +173,7 @@ pub struct Server {
     gateway: Gateway,
     health: Arc<Health>,
     /// Follows the store; ended with the server.
-    follower: JoinHandle<()>,
+    store_task: JoinHandle<()>,
     stop: CancellationToken,
     task: JoinHandle<Result<(), tonic::transport::Error>>,
 }
@@ -188,7 +188,7 @@ impl Server {
         let certificates = certificates(&options).await?;
         let keys = keys(&options).await?;
         let key_count = keys.as_ref().map(|keys| keys.borrow().len());
-        let meter = Meter::default();
+        let metrics_layer = MetricsLayer::default();
         let rates = Arc::new(Rates::new(options.rates, DefaultClock::default()));
         let authenticate = Authenticate::new(keys, rates);
         let budget = Budget::new(options.max_inflight_bytes);
@@ -198,7 +198,7 @@ impl Server {
         let (reporter, health_service) = tonic_health::server::health_reporter();
         let health = Arc::new(Health { reporter, draining: Mutex::new(false) });
         let mut store = engine.store_state();
-        health.tell(is_of_use(*store.borrow_and_update())).await;
+        health.set_serving(is_of_use(*store.borrow_and_update())).await;
         let services = services(&options, engine)?;
         let listener_options = listener::Options {
             certificates,
@@ -210,8 +210,8 @@ impl Server {
         };
         let gateway = Gateway {
             service: tower::ServiceBuilder::new()
-                .layer(meter.clone())
-                .layer(Explain)
+                .layer(metrics_layer.clone())
+                .layer(ErrorDetailsLayer)
                 .layer(authenticate.clone())
                 .layer(Inflight::new(Arc::clone(&budget)))
                 .service(services.clone()),
@@ -219,15 +219,15 @@ impl Server {
             describes: options.reflection,
             authenticate: authenticate.clone(),
             budget: Arc::clone(&budget),
-            refusals: meter.refusals.clone(),
+            refusals: metrics_layer.refusals.clone(),
         };
-        let router = router(&options, services, meter, authenticate, budget).add_service(health_service);
+        let router = router(&options, services, metrics_layer, authenticate, budget).add_service(health_service);
         let stop = CancellationToken::new();
         let stopped = stop.clone().cancelled_owned();
         let incoming = listener::incoming(listener, listener_options).into_stream();
         let task = tokio::spawn(router.serve_with_incoming_shutdown(incoming, stopped));
-        let follower = tokio::spawn(follow_store(Arc::clone(&health), store));
-        Ok(Self { address, key_count, gateway, health, follower, stop, task })
+        let store_task = tokio::spawn(follow_store(Arc::clone(&health), store));
+        Ok(Self { address, key_count, gateway, health, store_task, stop, task })
     }
 
     /// Where the server listens.
@@ -279,11 +279,11 @@ impl Server {
 impl Drop for Server {
     fn drop(&mut self) {
         self.task.abort();
-        self.follower.abort();
+        self.store_task.abort();
     }
 }
 
-/// What health checks are told.
+/// What health checks are answered.
 #[derive(Debug)]
 struct Health {
     reporter: HealthReporter,
@@ -293,7 +293,7 @@ struct Health {
 
 impl Health {
     /// Tells whether calls can be answered; while the server drains, nothing changes.
-    async fn tell(&self, serving: bool) {
+    async fn set_serving(&self, serving: bool) {
         let draining = self.draining.lock().await;
         if !*draining {
             self.set(if serving { ServingStatus::Serving } else { ServingStatus::NotServing }).await;
@@ -317,7 +317,7 @@ impl Health {
 async fn follow_store(health: Arc<Health>, mut store: watch::Receiver<StoreState>) {
     while store.changed().await.is_ok() {
         let state = *store.borrow_and_update();
-        health.tell(is_of_use(state)).await;
+        health.set_serving(is_of_use(state)).await;
     }
 }
 
@@ -332,7 +332,7 @@ async fn certificates(options: &Options) -> Result<Option<Current<ServerConfig>>
     let load = move || {
         let config = files.load()?;
         if let Some(certificate) = files.certificate() {
-            certificate.tell();
+            certificate.report();
         }
         Ok(config)
     };
@@ -361,15 +361,15 @@ async fn keys(options: &Options) -> Result<Option<Current<KeyRing>>, Error> {
     kept.map(Some).map_err(Error::Keys)
 }
 
-/// What goes around every service; the first to be added, [`Meter`], is outermost.
-type Layers = Stack<Inflight, Stack<Authenticate, Stack<Explain, Stack<Meter, Identity>>>>;
+/// What goes around every service; the first to be added, [`MetricsLayer`], is outermost.
+type Layers = Stack<Inflight, Stack<Authenticate, Stack<ErrorDetailsLayer, Stack<MetricsLayer, Identity>>>>;
 
 /// The API as another port of the same process serves it: the same services behind the same layers, and what it needs
 /// to treat its callers in the same way.
 #[derive(Debug, Clone)]
 pub struct Gateway {
     /// Calls that never leave the process.
-    pub service: Metered<Explained<Authenticated<Charged<Routes>>>>,
+    pub service: MetricsService<ErrorDetailsService<Authenticated<Charged<Routes>>>>,
     /// How gRPC's own connections are let in.
     pub listener: listener::Options,
     /// Whether callers may ask for the API's description.
@@ -385,15 +385,15 @@ impl Gateway {
     ///
     /// # Errors
     /// `UNAUTHENTICATED`.
-    pub fn check_key(&self, headers: &HeaderMap, introduction: &Introduction) -> Result<(), Status> {
-        self.authenticate.check(headers).inspect_err(|status| self.tell_refused(status, introduction))?;
-        introduction.make();
+    pub fn check_key(&self, headers: &HeaderMap, connection_info: &ConnectionInfo) -> Result<(), Status> {
+        self.authenticate.check(headers).inspect_err(|status| self.log_refused(status, connection_info))?;
+        connection_info.set_authenticated();
         Ok(())
     }
 
     /// Writes down that a request was refused before it became a call.
-    pub fn tell_refused(&self, status: &Status, introduction: &Introduction) {
-        self.refusals.tell_early(status, introduction);
+    pub fn log_refused(&self, status: &Status, connection_info: &ConnectionInfo) {
+        self.refusals.log_early(status, connection_info);
     }
 
     /// Whether callers need keys.
@@ -442,13 +442,13 @@ fn services(options: &Options, engine: Engine) -> Result<Routes, Error> {
 fn router(
     options: &Options,
     services: Routes,
-    meter: Meter,
+    metrics_layer: MetricsLayer,
     authenticate: Authenticate,
     budget: Arc<Budget>,
 ) -> Router<Layers> {
     tonic::transport::Server::builder()
-        .layer(meter)
-        .layer(Explain)
+        .layer(metrics_layer)
+        .layer(ErrorDetailsLayer)
         .layer(authenticate)
         .layer(Inflight::new(budget))
         .concurrency_limit_per_connection(MAX_REQUESTS_PER_CONNECTION)

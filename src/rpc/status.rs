@@ -222,8 +222,8 @@ pub fn rate_limited(bound: RateBound, wait: Duration) -> Status {
 }
 
 /// The messages of a `Solve` or of an upload stopped coming.
-pub fn input_stalled(patience: Duration) -> Status {
-    let message = format!("no message arrived for {} s and the input is not complete", patience.as_secs());
+pub fn input_stalled(timeout: Duration) -> Status {
+    let message = format!("no message arrived for {} s and the input is not complete", timeout.as_secs());
     status(Code::DeadlineExceeded, "INPUT_STALLED", message, ErrorDetails::new())
 }
 

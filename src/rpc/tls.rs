@@ -119,8 +119,8 @@ impl Certificate {
         }
     }
 
-    /// Tells its end to the metrics, and the log where clients will refuse it.
-    pub fn tell(self) {
+    /// Reports its end to the metrics, and to the log where clients will refuse it.
+    pub fn report(self) {
         certificate_end(self.end);
         if let Some(problem) = self.problem(SystemTime::now()) {
             tracing::warn!(problem, "clients will refuse the server's certificate (tls.certificate)");

@@ -24,12 +24,12 @@ struct Window {
 }
 
 impl Throttle {
-    /// Whether a line may be written now. Of those that may not, `tell` is told the number at the end of the minute.
-    pub fn allows(&self, tell: impl FnOnce(u64) + Send + 'static) -> bool {
+    /// Whether a line may be written now. Of those that may not, `report` gets the number at the end of the minute.
+    pub fn allows(&self, report: impl FnOnce(u64) + Send + 'static) -> bool {
         let now = Instant::now();
         let mut window = self.0.lock().unwrap_or_else(PoisonError::into_inner);
         if window.end.is_none_or(|end| end <= now) {
-            // What the minute before left out is about to be told by its task.
+            // What the minute before left out is about to be reported by its task.
             *window = Window { end: Some(now + MINUTE), lines: 0, left_out: window.left_out };
         }
         if window.lines < LINES {
@@ -46,7 +46,7 @@ impl Throttle {
                 let mut window = throttle.0.lock().unwrap_or_else(PoisonError::into_inner);
                 let left_out = std::mem::take(&mut window.left_out);
                 drop(window);
-                tell(left_out);
+                report(left_out);
             });
         }
         false

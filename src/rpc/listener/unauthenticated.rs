@@ -19,20 +19,20 @@ pub const AUTH_TIMEOUT: Duration = Duration::from_secs(30);
 /// Whether someone who may call has called over a connection, and from where. Goes with each of its requests; clones
 /// are the same one.
 #[derive(Debug, Clone, Default)]
-pub struct Introduction {
-    made: Arc<AtomicBool>,
+pub struct ConnectionInfo {
+    authenticated: Arc<AtomicBool>,
     peer: Option<SocketAddr>,
 }
 
-impl Introduction {
+impl ConnectionInfo {
     /// Someone who may call has.
-    pub fn make(&self) {
+    pub fn set_authenticated(&self) {
         // Nothing else is read by it.
-        self.made.store(true, Ordering::Relaxed);
+        self.authenticated.store(true, Ordering::Relaxed);
     }
 
-    fn is_made(&self) -> bool {
-        self.made.load(Ordering::Relaxed)
+    fn is_authenticated(&self) -> bool {
+        self.authenticated.load(Ordering::Relaxed)
     }
 
     /// The other end of the connection: the client, or the proxy before it.
@@ -41,10 +41,10 @@ impl Introduction {
     }
 }
 
-/// The time that a connection has for its introduction.
+/// The time that a connection has to authenticate.
 pub(super) struct AuthDeadline {
-    pub(super) introduction: Introduction,
-    /// `None`: it has been introduced, or may take for ever.
+    pub(super) connection_info: ConnectionInfo,
+    /// `None`: it has authenticated, or may take for ever.
     end: Option<Pin<Box<Sleep>>>,
 }
 
@@ -52,16 +52,16 @@ impl AuthDeadline {
     /// From now on; `None`: for ever.
     pub(super) fn begin(bound: Option<Duration>, peer: Option<SocketAddr>) -> Self {
         let end = bound.map(|bound| Box::pin(tokio::time::sleep(bound)));
-        Self { introduction: Introduction { peer, ..Introduction::default() }, end }
+        Self { connection_info: ConnectionInfo { peer, ..ConnectionInfo::default() }, end }
     }
 
     /// Lets the connection go on as long as there is time. Its task is woken when there is none any more.
     ///
     /// # Errors
-    /// Once the time is over and nobody was introduced: for the transport, the connection has broken.
+    /// Once the time is over and nobody has authenticated: for the transport, the connection has broken.
     pub(super) fn check(&mut self, context: &mut Context<'_>) -> io::Result<()> {
         let Some(end) = &mut self.end else { return Ok(()) };
-        if self.introduction.is_made() {
+        if self.connection_info.is_authenticated() {
             self.end = None;
             return Ok(());
         }
@@ -75,7 +75,7 @@ impl AuthDeadline {
 impl Drop for AuthDeadline {
     fn drop(&mut self) {
         let over = self.end.as_ref().is_some_and(|end| end.is_elapsed());
-        if over && !self.introduction.is_made() {
+        if over && !self.connection_info.is_authenticated() {
             metrics::unauthenticated_closed();
             tracing::debug!("a connection was closed: nobody who may call had called over it");
         }

@@ -160,13 +160,13 @@ fn guards_give_back_what_they_took_and_a_dropped_call_is_cancelled() {
     let recorder = recorder().expect("recorder");
     let render = || recorder.handle().render();
     metrics::with_local_recorder(&recorder, || {
-        let (worker, follower) = (busy_worker(), watcher());
+        let (worker, watcher_guard) = (busy_worker(), watcher());
         let call = RpcCall::begin("scpsfm.v1.JobService/WatchJob");
         let during = render();
         for series in ["scpsfm_workers_busy", "scpsfm_watchers", "scpsfm_grpc_requests_in_flight"] {
             assert_eq!(value(&during, series), Some(1.0), "{series}");
         }
-        drop((worker, follower, call));
+        drop((worker, watcher_guard, call));
         let after = render();
         for series in ["scpsfm_workers_busy", "scpsfm_watchers", "scpsfm_grpc_requests_in_flight"] {
             assert_eq!(value(&after, series), Some(0.0), "{series}");

@@ -6,13 +6,13 @@ use tokio::sync::mpsc;
 
 use crate::engine::{Error, Upload};
 
-/// Parts that are read ahead of the decoder.
-const AHEAD: usize = 2;
+/// Parts that are read before the decoder asks for them.
+const PREFETCHED_PARTS: usize = 2;
 
 /// What stands in for bytes that could not be read, so that whoever reads comes to an end.
 const ZEROS: [u8; 4096] = [0; 4096];
 
-/// Reads the whole of an upload, in order, for a [`Parts`]; ends early where nobody wants more.
+/// Reads the whole of an upload, in order, for a [`UploadReader`]; ends early where nobody wants more.
 pub async fn feed(upload: &Upload, parts: mpsc::Sender<Result<Bytes, Error>>) {
     let mut at = 0;
     while at < upload.committed() {
@@ -29,7 +29,7 @@ pub async fn feed(upload: &Upload, parts: mpsc::Sender<Result<Bytes, Error>>) {
 }
 
 /// The bytes of an upload, hashed as they go by. Waits for them: not for a thread that serves others.
-pub struct Parts {
+pub struct UploadReader {
     parts: mpsc::Receiver<Result<Bytes, Error>>,
     current: Bytes,
     remaining: usize,
@@ -37,10 +37,10 @@ pub struct Parts {
     failed: Option<Error>,
 }
 
-impl Parts {
+impl UploadReader {
     /// Of an upload of that length, and where [`feed`] is to put its parts.
     pub fn new(bytes: usize) -> (mpsc::Sender<Result<Bytes, Error>>, Self) {
-        let (sender, parts) = mpsc::channel(AHEAD);
+        let (sender, parts) = mpsc::channel(PREFETCHED_PARTS);
         (sender, Self { parts, current: Bytes::new(), remaining: bytes, hash: Sha256::new(), failed: None })
     }
 
@@ -81,7 +81,7 @@ impl Parts {
     }
 }
 
-impl Buf for Parts {
+impl Buf for UploadReader {
     fn remaining(&self) -> usize {
         self.remaining
     }
@@ -109,23 +109,23 @@ impl Buf for Parts {
 mod tests {
     use super::*;
 
-    /// Parts of these bytes that come in pieces of that length, and where they end.
-    fn parts(bytes: &[u8], piece: usize, end: Option<Error>) -> Parts {
-        let (sender, parts) = Parts::new(bytes.len() + usize::from(end.is_some()));
+    /// A reader of these bytes that come in pieces of that length, and where they end.
+    fn reader(bytes: &[u8], piece: usize, end: Option<Error>) -> UploadReader {
+        let (sender, reader) = UploadReader::new(bytes.len() + usize::from(end.is_some()));
         let pieces: Vec<_> = bytes.chunks(piece).map(|piece| Ok(Bytes::copy_from_slice(piece))).collect();
         std::thread::spawn(move || {
             for piece in pieces.into_iter().chain(end.map(Err)) {
                 sender.blocking_send(piece).expect("somebody reads");
             }
         });
-        parts.begun()
+        reader.begun()
     }
 
     #[test]
     fn the_bytes_and_their_hash_are_those_that_were_stored() {
         let bytes: Vec<u8> = (0..10_000_u32).map(|k| (k % 251) as u8).collect();
         for piece in [1, 7, 4096, 20_000] {
-            let mut reader = parts(&bytes, piece, None);
+            let mut reader = reader(&bytes, piece, None);
             let mut read = vec![0; 5_000];
             reader.copy_to_slice(&mut read);
             assert_eq!(read, bytes[..5_000]);
@@ -137,7 +137,7 @@ mod tests {
     #[test]
     fn bytes_that_cannot_be_read_end_the_reading() {
         let away = Error::Unavailable("away".into());
-        let mut reader = parts(&[1; 100], 30, Some(away.clone()));
+        let mut reader = reader(&[1; 100], 30, Some(away.clone()));
         let mut read = vec![9; 101];
         reader.copy_to_slice(&mut read);
         assert_eq!((read[99], read[100]), (1, 0));

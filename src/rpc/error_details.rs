@@ -13,23 +13,23 @@ use super::status;
 
 /// The layer; goes around every service, and within the one that counts calls.
 #[derive(Debug, Clone, Copy, Default)]
-pub struct Explain;
+pub struct ErrorDetailsLayer;
 
-impl<S> Layer<S> for Explain {
-    type Service = Explained<S>;
+impl<S> Layer<S> for ErrorDetailsLayer {
+    type Service = ErrorDetailsService<S>;
 
-    fn layer(&self, inner: S) -> Explained<S> {
-        Explained { inner }
+    fn layer(&self, inner: S) -> ErrorDetailsService<S> {
+        ErrorDetailsService { inner }
     }
 }
 
 /// A service whose refusals all have a reason.
 #[derive(Debug, Clone)]
-pub struct Explained<S> {
+pub struct ErrorDetailsService<S> {
     inner: S,
 }
 
-impl<S, B> Service<Request<B>> for Explained<S>
+impl<S, B> Service<Request<B>> for ErrorDetailsService<S>
 where
     S: Service<Request<B>, Response = Response<Body>>,
     S::Future: Send + 'static,
@@ -46,7 +46,7 @@ where
         let answer = self.inner.call(request);
         Box::pin(async move {
             let mut answer = answer.await?;
-            explain(answer.headers_mut());
+            add_details(answer.headers_mut());
             Ok(answer)
         })
     }
@@ -54,14 +54,14 @@ where
 
 /// Replaces a status that the transport made. Only headers can hold one: what is wrong with a request is known before
 /// its answer begins.
-fn explain(headers: &mut HeaderMap) {
+fn add_details(headers: &mut HeaderMap) {
     if headers.contains_key(Status::GRPC_STATUS_DETAILS) {
         return;
     }
-    let Some(explained) = Status::from_header_map(headers).as_ref().and_then(status::from_transport) else { return };
-    // Fails for a sentence that no header can hold, which then stays unexplained.
-    if let Err(error) = explained.add_header(headers) {
-        tracing::warn!(%error, "cannot explain a refusal of the transport");
+    let Some(detailed) = Status::from_header_map(headers).as_ref().and_then(status::from_transport) else { return };
+    // Fails for a sentence that no header can hold, which then stays without details.
+    if let Err(error) = detailed.add_header(headers) {
+        tracing::warn!(%error, "cannot add details to a refusal of the transport");
     }
 }
 
@@ -72,10 +72,10 @@ mod tests {
 
     use super::*;
 
-    fn explained(found: &Status) -> Status {
+    fn detailed(found: &Status) -> Status {
         let mut headers = HeaderMap::new();
         found.add_header(&mut headers).expect("a header");
-        explain(&mut headers);
+        add_details(&mut headers);
         Status::from_header_map(&headers).expect("a status")
     }
 
@@ -87,20 +87,20 @@ mod tests {
             (Code::Internal, Code::InvalidArgument, "MALFORMED_MESSAGE"),
         ];
         for (found, code, reason) in cases {
-            let status = explained(&Status::new(found, "100 % wrong"));
+            let status = detailed(&Status::new(found, "100 % wrong"));
             assert_eq!(status.code(), code);
             assert!(status.message().contains("100 % wrong"), "{status}");
             assert_eq!(status.get_details_error_info().expect("an ErrorInfo").reason, reason);
         }
         for code in [Code::Ok, Code::Unimplemented, Code::NotFound, Code::Cancelled] {
-            let status = explained(&Status::new(code, "as it was"));
+            let status = detailed(&Status::new(code, "as it was"));
             assert_eq!((status.code(), status.message(), status.details().len()), (code, "as it was", 0));
         }
-        let ours = explained(&status::internal(&"a defect"));
+        let ours = detailed(&status::internal(&"a defect"));
         assert_eq!(ours.code(), Code::Internal);
         assert_eq!(ours.get_details_error_info().expect("an ErrorInfo").reason, "INTERNAL");
         let mut none = HeaderMap::new();
-        explain(&mut none);
+        add_details(&mut none);
         assert!(none.is_empty());
     }
 }
