@@ -69,7 +69,7 @@ pub fn run(
     let rows = tokio::task::block_in_place(|| {
         let solve = |index: usize| solve(index, &windows::cut(input, &ranges[index]), settings, &stop);
         on_threads(ranges.len(), threads.count(), &stop, &solve, &mut |event| {
-            tell(&mut progress, event, &ranges, input)
+            report_progress(&mut progress, event, &ranges, input)
         })
     });
     relay.abort();
@@ -110,7 +110,7 @@ enum Event {
 }
 
 /// Shows which window is at work, and what came of those that are done.
-fn tell(progress: &mut ProgressView, event: &Event, ranges: &[Range<usize>], input: &LabelledInput) {
+fn report_progress(progress: &mut ProgressView, event: &Event, ranges: &[Range<usize>], input: &LabelledInput) {
     let count = ranges.len();
     match event {
         Event::Begun(index) => {
@@ -134,7 +134,7 @@ fn on_threads(
     threads: usize,
     stop: &StopToken,
     solve: &(dyn Fn(usize) -> Result<Row, solver::Error> + Sync),
-    told: &mut dyn FnMut(&Event),
+    report: &mut dyn FnMut(&Event),
 ) -> Result<Vec<Row>, Failure> {
     let next = AtomicUsize::new(0);
     let (sender, receiver) = mpsc::channel();
@@ -159,7 +159,7 @@ fn on_threads(
         for event in receiver {
             match event {
                 Ok(event) => {
-                    told(&event);
+                    report(&event);
                     if let Event::Ended(row) = event {
                         rows.push(*row);
                     }

@@ -1,4 +1,4 @@
-//! Which addresses a server may listen on, by what keeps strangers out.
+//! Which addresses a server may listen on, by what keeps unauthenticated callers out.
 
 use std::net::SocketAddr;
 

@@ -54,7 +54,7 @@ pub enum Error {
     /// A file without the one that belongs to it.
     #[error("configuration: {key} is set, and {missing} is not: both or neither")]
     Half { key: &'static str, missing: &'static str },
-    /// A port that would be open to a network without what keeps strangers out.
+    /// A port that would be open to a network without what keeps unauthenticated callers out.
     #[error("configuration: {0}")]
     Exposed(#[from] exposure::Exposed),
     /// A variable of the environment that looks like a key and is none.

@@ -63,7 +63,7 @@ impl View {
 
 /// An input as a caller states it, before any check. Structure of arrays: one entry an observation.
 ///
-/// Field names in violations are prefixed by `prefix`, so that each front door speaks of its own fields.
+/// Field names in violations are prefixed by `prefix`, so that each transport names its own fields.
 #[derive(Debug, Clone, Default)]
 pub struct RawInput {
     pub views: Vec<View>,

@@ -31,7 +31,7 @@ pub struct Watch {
     weights: channel::Receiver<Option<Arc<JobEvent>>>,
     phase: channel::Receiver<Phase>,
     /// Read and not yet handed out.
-    ahead: VecDeque<JobEvent>,
+    buffered: VecDeque<JobEvent>,
     /// Sequence number of the last event that was read.
     after: u64,
     /// Nothing was in the store beyond `after` when this version of the channel was seen.
@@ -71,7 +71,7 @@ impl Watch {
             version,
             weights,
             phase,
-            ahead: VecDeque::new(),
+            buffered: VecDeque::new(),
             after,
             caught_up: false,
             ended,
@@ -91,7 +91,7 @@ impl Watch {
         }
         let event = self.advance().await;
         self.ended = match &event {
-            Ok(event) => is_end(event) && self.ahead.is_empty(),
+            Ok(event) => is_end(event) && self.buffered.is_empty(),
             Err(_) => true,
         };
         Some(event)
@@ -105,8 +105,8 @@ impl Watch {
     async fn advance(&mut self) -> Result<JobEvent, Error> {
         loop {
             // Where an end is the last event that was read, and not all were, a retry may follow it.
-            let may_go_on = self.ahead.len() == 1 && !self.caught_up && self.ahead.front().is_some_and(is_end);
-            if !may_go_on && let Some(event) = self.ahead.pop_front() {
+            let may_go_on = self.buffered.len() == 1 && !self.caught_up && self.buffered.front().is_some_and(is_end);
+            if !may_go_on && let Some(event) = self.buffered.pop_front() {
                 return Ok(event);
             }
             if !self.caught_up || self.version.has_changed().unwrap_or(true) {
@@ -114,8 +114,8 @@ impl Watch {
                 self.caught_up = false;
                 let read = self.inner.store.events_after(&self.name, self.after, READ_AHEAD).await?;
                 self.caught_up = read.len() < READ_AHEAD as usize;
-                self.ahead.extend(read);
-                self.after = self.ahead.back().and_then(|event| event.sequence).unwrap_or(self.after);
+                self.buffered.extend(read);
+                self.after = self.buffered.back().and_then(|event| event.sequence).unwrap_or(self.after);
                 continue;
             }
             if *self.phase.borrow_and_update() == Phase::Closed {

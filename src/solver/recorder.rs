@@ -30,15 +30,15 @@ fn fraction_of_extension_at(stage: Stage) -> f64 {
     }
 }
 
-/// Time between two signs of life within a stage: often enough for eyes, and nothing beside the work between them.
-const SIGN_PERIOD: Duration = Duration::from_millis(100);
+/// Time between two heartbeats within a stage: often enough for eyes, and nothing beside the work between them.
+const HEARTBEAT_PERIOD: Duration = Duration::from_millis(100);
 
 /// Verdicts that a track gets at most.
 const JUDGED_TIMES: usize = 2;
 
 /// State of the best hypothesis, as progress reports it.
 #[derive(Debug, Clone, Copy, Default)]
-pub struct Standing {
+pub struct HypothesisState {
     pub iteration: u32,
     pub losses: Option<Losses>,
     pub head: Option<HeadProgress>,
@@ -61,15 +61,15 @@ pub struct Recorder<'a> {
     /// Share of the whole that the blocks have: all, or what an extension leaves them.
     share_of_blocks: f64,
     extending: bool,
-    /// Standing before the block of a further component, while that is solved.
-    before_component: Option<Standing>,
+    /// State before the block of a further component, while that is solved.
+    before_component: Option<HypothesisState>,
     /// Network iterations of the blocks before.
     earlier_iterations: u32,
     history: Vec<Progress>,
     /// Every so many records go into the history; doubled whenever it is full.
     stride: usize,
     records: usize,
-    pub standing: Standing,
+    pub hypothesis: HypothesisState,
     reconstruction: ReconstructionProgress,
     last_report: Instant,
 }
@@ -95,7 +95,7 @@ impl<'a> Recorder<'a> {
             history: Vec::new(),
             stride: 1,
             records: 0,
-            standing: Standing::default(),
+            hypothesis: HypothesisState::default(),
             reconstruction: ReconstructionProgress { views: views as u32, ..ReconstructionProgress::default() },
             last_report: now,
         }
@@ -118,8 +118,8 @@ impl<'a> Recorder<'a> {
 
     /// Begins the search of a block anew: its course so far counts as work.
     pub fn begin_again(&mut self) {
-        self.earlier_iterations += self.standing.iteration;
-        self.standing = Standing::default();
+        self.earlier_iterations += self.hypothesis.iteration;
+        self.hypothesis = HypothesisState::default();
     }
 
     /// Says beforehand that the best block will be extended.
@@ -135,15 +135,15 @@ impl<'a> Recorder<'a> {
     /// Begins the block of a further component: its course counts as work, and moves the share done no further.
     pub fn begin_component(&mut self, component: u32) {
         self.reconstruction.part = component;
-        self.earlier_iterations += self.standing.iteration;
-        self.before_component = Some(std::mem::take(&mut self.standing));
+        self.earlier_iterations += self.hypothesis.iteration;
+        self.before_component = Some(std::mem::take(&mut self.hypothesis));
     }
 
     /// Ends it: what stands is again what stood before.
     pub fn end_component(&mut self) {
-        self.earlier_iterations += self.standing.iteration;
+        self.earlier_iterations += self.hypothesis.iteration;
         if let Some(before) = self.before_component.take() {
-            self.standing = Standing { iteration: 0, ..before };
+            self.hypothesis = HypothesisState { iteration: 0, ..before };
         }
         self.enter(Stage::Extend);
     }
@@ -155,9 +155,9 @@ impl<'a> Recorder<'a> {
 
     /// An iteration of the network is done; told with the next [`Self::report`].
     pub fn optimised(&mut self, head: HeadProgress, losses: Losses) {
-        self.standing.iteration += 1;
-        self.standing.losses = Some(losses);
-        self.standing.head = Some(head);
+        self.hypothesis.iteration += 1;
+        self.hypothesis.losses = Some(losses);
+        self.hypothesis.head = Some(head);
     }
 
     /// Records what stands now instead of what the search found: after every step that changes it, and before
@@ -166,8 +166,8 @@ impl<'a> Recorder<'a> {
     /// * `inliers`: tracks
     /// * `focal_px`: of the first camera that has one; `None` where the focal length is not determined
     pub fn found(&mut self, inliers: usize, focal_px: Option<f64>) {
-        self.standing.inliers = inliers as u32;
-        self.standing.focal_px = focal_px;
+        self.hypothesis.inliers = inliers as u32;
+        self.hypothesis.focal_px = focal_px;
     }
 
     /// So many views have a camera. What a block of a further component has counts once it is among the others.
@@ -186,7 +186,7 @@ impl<'a> Recorder<'a> {
         self.report(0.0);
     }
 
-    /// Tells the observer the current standing; `within` is the share of the stage that is done.
+    /// Reports the current state to the observer; `within` is the share of the stage that is done.
     pub fn report(&mut self, within: f64) {
         self.advance(within);
         let progress = self.progress();
@@ -213,11 +213,11 @@ impl<'a> Recorder<'a> {
         self.step(Task::Judge, verdicts, most, verdicts as f64 / most.max(1) as f64);
     }
 
-    /// Tells the observer the current standing if it has heard nothing for a while.
+    /// Reports the current state to the observer if it got nothing for a while.
     ///
     /// When that is depends on the machine, so that none of it goes into the history: one input has one answer.
     pub fn heartbeat(&mut self) {
-        if self.last_report.elapsed() >= SIGN_PERIOD {
+        if self.last_report.elapsed() >= HEARTBEAT_PERIOD {
             let progress = self.progress();
             self.observer.progress(&progress);
             self.last_report = Instant::now();
@@ -233,11 +233,11 @@ impl<'a> Recorder<'a> {
             stage: self.stage,
             fraction: self.fraction,
             iteration: self.iteration(),
-            losses: self.standing.losses,
-            head: self.standing.head,
-            inliers: self.standing.inliers,
-            focal_px: self.standing.focal_px,
-            best_score: self.standing.best_score,
+            losses: self.hypothesis.losses,
+            head: self.hypothesis.head,
+            inliers: self.hypothesis.inliers,
+            focal_px: self.hypothesis.focal_px,
+            best_score: self.hypothesis.best_score,
             elapsed_seconds: self.seconds(),
             reconstruction: self.reconstruction,
         }
@@ -265,7 +265,7 @@ impl<'a> Recorder<'a> {
 
     /// Network iterations so far, over all blocks.
     pub fn iteration(&self) -> u32 {
-        self.earlier_iterations + self.standing.iteration
+        self.earlier_iterations + self.hypothesis.iteration
     }
 
     /// Seconds since the solve began.
@@ -325,7 +325,7 @@ mod tests {
     fn what_is_found_last_is_told_last() {
         let mut silent = crate::domain::Silent;
         let mut recorder = Recorder::new(&mut silent, 10);
-        (recorder.standing.inliers, recorder.standing.focal_px) = (20, Some(700.0));
+        (recorder.hypothesis.inliers, recorder.hypothesis.focal_px) = (20, Some(700.0));
         recorder.enter(Stage::Calibrate);
         recorder.found(180, Some(812.5));
         let told = |history: &[Progress]| history.last().map(|record| (record.inliers, record.focal_px));

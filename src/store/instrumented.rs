@@ -1,4 +1,4 @@
-//! A store that reports to the metrics how long each of its operations took and which came too late, whatever implements it.
+//! A store that measures how long each of its operations took and counts which came too late, whatever implements it.
 
 use std::sync::Arc;
 use std::time::{Duration, SystemTime};

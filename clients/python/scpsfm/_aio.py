@@ -184,16 +184,17 @@ class AsyncClient:
         """Solves while the caller waits; see `Client.solve`. A task that is cancelled cancels the job."""
         options = JobOptions(settings, labels, priority, time_limit, None, request_id)
         source = tracks.name if isinstance(tracks, InputInfo) else tracks
-        told = flows.Told()
+        follower = flows.EventFollower()
         with Watcher(progress) as watcher:
             try:
-                message = await self._run(flows.solve(self._context, source, options, told, timeout), watcher)
+                message = await self._run(flows.solve(self._context, source, options, follower, timeout), watcher)
             except JobError:
                 raise
             except BaseException:
-                if told.name:
+                if follower.name:
                     with contextlib.suppress(Exception):
-                        await asyncio.shield(asyncio.ensure_future(self.job(told.name).cancel(timeout=CANCEL_SECONDS)))
+                        cancel = self.job(follower.name).cancel(timeout=CANCEL_SECONDS)
+                        await asyncio.shield(asyncio.ensure_future(cancel))
                 raise
         return flows.finished(message, source)
 

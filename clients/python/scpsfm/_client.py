@@ -222,16 +222,16 @@ class Client:
         """
         options = JobOptions(settings, labels, priority, time_limit, None, request_id)
         source = tracks.name if isinstance(tracks, InputInfo) else tracks
-        told = flows.Told()
+        follower = flows.EventFollower()
         with Watcher(progress) as watcher:
             try:
-                message = self._run(flows.solve(self._context, source, options, told, timeout), watcher)
+                message = self._run(flows.solve(self._context, source, options, follower, timeout), watcher)
             except JobError:
                 raise
             except BaseException:
-                if told.name:
+                if follower.name:
                     with contextlib.suppress(Exception):
-                        self.job(told.name).cancel(timeout=CANCEL_SECONDS)
+                        self.job(follower.name).cancel(timeout=CANCEL_SECONDS)
                 raise
         return flows.finished(message, source)
 

@@ -394,7 +394,7 @@ def _is_end(event: job_pb2.JobEvent) -> bool:
 
 
 @dataclass
-class Told:
+class EventFollower:
     """Which of a job's events were handed on: each sequenced one once."""
 
     sequence: int = 0
@@ -433,12 +433,12 @@ def watch(context: Context, name: str, after: int, timeout: float | None) -> Flo
 
 
 def _watch(trouble: Trouble, name: str, after: int) -> Flow[job_pb2.JobEvent | None]:
-    told = Told(after)
+    follower = EventFollower(after)
     while True:
         try:
-            request = job_service_pb2.WatchJobRequest(name=name, after_sequence=told.sequence)
+            request = job_service_pb2.WatchJobRequest(name=name, after_sequence=follower.sequence)
             stream = yield Open("WatchJob", request, trouble.left())
-            return (yield from told.follow(stream, trouble))
+            return (yield from follower.follow(stream, trouble))
         except ScpsfmError as error:
             yield trouble.failed(error)
 
@@ -508,12 +508,12 @@ def _read_result(trouble: Trouble, name: str) -> Flow[result_pb2.JobResult]:
 
 
 def solve(
-    context: Context, tracks: Source | str, options: JobOptions, told: Told, timeout: float | None
+    context: Context, tracks: Source | str, options: JobOptions, follower: EventFollower, timeout: float | None
 ) -> Flow[result_pb2.JobResult]:
     """Creates a job, follows it to its end and reads its result. Emits its events.
 
-    A broken call is made again under the same request id, which takes up the job. `told` has the job's name, once it is
-    known, so that whoever gives up can cancel it.
+    A broken call is made again under the same request id, which takes up the job. `follower` has the job's name, once
+    it is known, so that whoever gives up can cancel it.
     """
     trouble = Trouble(context, timeout)
     config = create_request(context, options)
@@ -534,22 +534,22 @@ def solve(
     while True:
         try:
             stream = yield Open("Solve", messages(), trouble.left())
-            last = yield from told.follow(stream, trouble)
+            last = yield from follower.follow(stream, trouble)
         except ScpsfmError as error:
             try:
                 yield trouble.failed(error)
             except ScpsfmError as final:
-                final.job = told.name or None
+                final.job = follower.name or None
                 raise _named(final, config.request_id, tracks) from final.__cause__
         else:
             break
     if last is None:
-        raise InternalError("the server ended a solve without its last event", job=told.name or None)
+        raise InternalError("the server ended a solve without its last event", job=follower.name or None)
     change = last.state_change
-    failure = ended(told.name, state_of(change.state), change.error.reason, change.error.message)
+    failure = ended(follower.name, state_of(change.state), change.error.reason, change.error.message)
     if failure is not None:
         raise failure
-    return (yield from _read_result(trouble, told.name))
+    return (yield from _read_result(trouble, follower.name))
 
 
 def delete(context: Context, name: str, etag: str, timeout: float | None) -> Flow[None]:

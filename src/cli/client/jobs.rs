@@ -152,12 +152,12 @@ impl Client {
         after_sequence: u64,
         on_event: &mut (dyn FnMut(&JobEvent) + Send),
     ) -> Result<Option<JobEvent>, Error> {
-        let mut told = Told { last_sequence: after_sequence, on_event };
+        let mut follower = EventFollower { last_sequence: after_sequence, on_event };
         let mut backoff = Backoff::default();
         loop {
-            let request = proto::WatchJobRequest { name: name.to_string(), after_sequence: told.last_sequence };
+            let request = proto::WatchJobRequest { name: name.to_string(), after_sequence: follower.last_sequence };
             let outcome = match backoff.within(self.jobs.watch_job(request)).await {
-                Ok(events) => told.follow(events.into_inner(), &mut backoff).await?,
+                Ok(events) => follower.follow(events.into_inner(), &mut backoff).await?,
                 Err(status) => Err(status),
             };
             match outcome {
@@ -221,12 +221,12 @@ impl Client {
 }
 
 /// Passes events on, each sequenced one once.
-pub(super) struct Told<'a> {
+pub(super) struct EventFollower<'a> {
     pub(super) last_sequence: u64,
     pub(super) on_event: &'a mut (dyn FnMut(&JobEvent) + Send),
 }
 
-impl Told<'_> {
+impl EventFollower<'_> {
     /// Follows one stream, which the server has just taken, to its end. The inner error is worth another try; `None`:
     /// it ended without a terminal state.
     pub(super) async fn follow(

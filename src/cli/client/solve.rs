@@ -4,7 +4,7 @@ use tokio_util::sync::CancellationToken;
 use tonic::Request;
 
 use super::backoff::Backoff;
-use super::jobs::{JobOptions, Told, create_request, ended};
+use super::jobs::{EventFollower, JobOptions, create_request, ended};
 use super::{Client, Error, Outgoing};
 use crate::cli::args::ServerArgs;
 use crate::domain::job::JobEvent;
@@ -52,14 +52,14 @@ impl Client {
         on_event: &mut (dyn FnMut(&JobEvent) + Send),
     ) -> Result<JobEvent, Error> {
         let config = create_request(self.parent(), input.head(), settings, JobOptions::default());
-        let mut told = Told { last_sequence: 0, on_event };
+        let mut follower = EventFollower { last_sequence: 0, on_event };
         let mut backoff = Backoff::default();
         loop {
             use proto::solve_request::Message;
             let messages = std::iter::once(Message::Config(config.clone())).chain(input.chunks());
             let messages = messages.map(|message| proto::SolveRequest { message: Some(message) });
             let outcome = match self.calibration.solve(Request::new(tokio_stream::iter(messages))).await {
-                Ok(events) => told.follow(events.into_inner(), &mut backoff).await?,
+                Ok(events) => follower.follow(events.into_inner(), &mut backoff).await?,
                 Err(status) => Err(status),
             };
             match outcome {

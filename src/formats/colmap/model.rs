@@ -84,12 +84,12 @@ fn open(path: &Path) -> Result<(BufReader<File>, u64), Error> {
 }
 
 /// Bounds while reading what a file announces.
-struct Room {
+struct ReadBounds {
     most_views: usize,
     most_observations: usize,
 }
 
-impl Room {
+impl ReadBounds {
     fn new(limits: &Limits) -> Self {
         Self { most_views: limits.max_views, most_observations: limits.max_observations }
     }

@@ -246,7 +246,7 @@ pub fn calibrate(
         VerifiedBy::Depths { focal } => depths::calibrate(problem, &attempt.block.complete, consensus, focal),
     });
     if let Some(intrinsics) = attempt.calibration.as_ref().and_then(Outcome::intrinsics) {
-        recorder.standing.focal_px = Some(intrinsics.focal * problem.scale_px);
+        recorder.hypothesis.focal_px = Some(intrinsics.focal * problem.scale_px);
     }
     recorder.registered(projective.views.len());
     recorder.report(1.0);
@@ -298,8 +298,8 @@ fn search(
         return Ok(attempt);
     }
     let (mut refined, ln_false_alarms) = grow::refine(complete, &consensus, portfolio::spread(complete), problem.stop);
-    recorder.standing.inliers = refined.inlier_count() as u32;
-    recorder.standing.best_score = Some(refined.score);
+    recorder.hypothesis.inliers = refined.inlier_count() as u32;
+    recorder.hypothesis.best_score = Some(refined.score);
     recorder.report(1.0);
     let counted = match &attempt.found.track_scores {
         Some(track_scores) => track_scores.counted(&refined.inliers()),
@@ -323,7 +323,7 @@ fn search(
     }
     if let Some((block, consensus)) = all_tracks::extend(problem, &attempt.block, &refined) {
         attempt.found.network_weights = carry_over(&attempt.found.network_weights, &attempt.block, &block);
-        recorder.standing.inliers = consensus.inlier_count() as u32;
+        recorder.hypothesis.inliers = consensus.inlier_count() as u32;
         // What the network says of a sample, it does not say of all.
         attempt.found.track_scores = None;
         (attempt.block, refined) = (block, consensus);

@@ -84,9 +84,9 @@ fn report(problem: &Problem, tracks: &[usize], step: &HeadReport, recorder: &mut
     let iteration = step.head.iteration;
     recorder.begin_step(Task::Heads, step.head.head as usize, step.heads);
     recorder.optimised(step.head, step.losses);
-    recorder.standing.inliers = step.weights.iter().filter(|&&weight| weight > THRESHOLD).count() as u32;
+    recorder.hypothesis.inliers = step.weights.iter().filter(|&&weight| weight > THRESHOLD).count() as u32;
     if settings.use_daq {
-        recorder.standing.focal_px = Some(step.focal * problem.scale_px);
+        recorder.hypothesis.focal_px = Some(step.focal * problem.scale_px);
     }
     let done = f64::from(step.head.head - 1) + f64::from(iteration) / f64::from(settings.iterations);
     recorder.report(done / step.heads as f64);

@@ -139,7 +139,7 @@ impl<'a> Growing<'a> {
     }
 
     /// What is kept: the verified points of the longest tracks until every view has `of_view` observations.
-    fn standing(&self, of_view: usize) -> ProjectiveReconstruction {
+    fn reconstruction(&self, of_view: usize) -> ProjectiveReconstruction {
         let problem = self.problem;
         let views = self.views();
         let mut place = vec![usize::MAX; self.cameras.len()];
@@ -165,26 +165,30 @@ impl<'a> Growing<'a> {
 
     /// Adjusts all registered views with the points that hold them best, and estimates the noise from what remains.
     fn adjust(&mut self, iterations: usize, recorder: &mut Recorder) {
-        let mut standing = self.standing(self.options.of_view);
-        if standing.observations.is_empty() {
+        let mut reconstruction = self.reconstruction(self.options.of_view);
+        if reconstruction.observations.is_empty() {
             return;
         }
         let options = self.options.adjustment(iterations, self.noise);
-        let ProjectiveReconstruction { cameras, points, observations, .. } = &mut standing;
+        let ProjectiveReconstruction { cameras, points, observations, .. } = &mut reconstruction;
         bundle::projective::adjust(cameras, points, observations, &options, self.problem.stop);
         recorder.heartbeat();
         if self.problem.stop.is_stopped() {
             return;
         }
-        self.noise = self.noise_of(&standing);
-        let standing = standing.oriented();
-        standing.views.iter().zip(&standing.cameras).for_each(|(&view, camera)| self.cameras[view] = Some(*camera));
+        self.noise = self.noise_of(&reconstruction);
+        let reconstruction = reconstruction.oriented();
+        reconstruction
+            .views
+            .iter()
+            .zip(&reconstruction.cameras)
+            .for_each(|(&view, camera)| self.cameras[view] = Some(*camera));
     }
 
     /// Core noise of the residuals: their median, for what their freedom leaves of it.
-    fn noise_of(&self, standing: &ProjectiveReconstruction) -> f64 {
-        let norms: Vec<f64> = standing.squared_residuals().into_iter().map(f64::sqrt).collect();
-        let unknowns = CAMERA_UNKNOWNS * standing.views.len() + 3 * standing.tracks.len();
+    fn noise_of(&self, reconstruction: &ProjectiveReconstruction) -> f64 {
+        let norms: Vec<f64> = reconstruction.squared_residuals().into_iter().map(f64::sqrt).collect();
+        let unknowns = CAMERA_UNKNOWNS * reconstruction.views.len() + 3 * reconstruction.tracks.len();
         let noise = adjust::core_noise(norms, unknowns);
         let (least, most) = NoiseOptions::DEFAULT.bounds;
         noise.clamp(least, (self.options.noise_growth * self.start_noise).min(most))
@@ -212,7 +216,7 @@ impl<'a> Growing<'a> {
     }
 
     fn finish(self) -> ProjectiveReconstruction {
-        self.standing(usize::MAX)
+        self.reconstruction(usize::MAX)
     }
 }
 

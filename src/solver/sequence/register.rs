@@ -120,7 +120,7 @@ impl Growth for Component<'_> {
         structure::triangulate_seen(problem, model, &[view], recorder);
         let registered = model.registered();
         let focal = model.log_focal(problem.camera_of[view], &registered).exp();
-        recorder.standing.focal_px = Some(focal * problem.scale_px);
+        recorder.hypothesis.focal_px = Some(focal * problem.scale_px);
         recorder.registered(registered.len());
         let share = registered.len() as f64 / problem.observed_views().len() as f64;
         recorder.report(EXTENSION.share_of_registering * share);
@@ -131,7 +131,7 @@ impl Growth for Component<'_> {
         adjust::while_growing(self.problem, self.model, self.component, recorder);
         adjust::rescale(self.problem, self.model, self.component);
         structure::triangulate_seen(self.problem, self.model, &self.model.of_component(self.component), recorder);
-        recorder.standing.inliers = adjust::verified(self.model).len() as u32;
+        recorder.hypothesis.inliers = adjust::verified(self.model).len() as u32;
     }
 }
 

@@ -5,13 +5,13 @@ use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 
 /// A group: as many tracks as this that follow a wrong one, each observation moved by so much.
-struct Crowd {
+struct WrongGroup {
     tracks: usize,
     jitter_px: f64,
 }
 
 /// A scene with groups about its first wrong tracks; and the truth of every track, those of the groups last.
-fn with_groups(options: SceneOptions, groups: &[Crowd]) -> (Input, Vec<bool>) {
+fn with_groups(options: SceneOptions, groups: &[WrongGroup]) -> (Input, Vec<bool>) {
     let mut rng = ChaCha8Rng::seed_from_u64(options.seed);
     let (input, scene) = scene(options);
     let mut raw = input.to_raw();
@@ -44,7 +44,7 @@ fn by_geometry(input: &Input) -> Solution {
 fn a_crowd_about_a_wrong_track_outvotes_no_right_ones() {
     for (seed, jitter_px) in [(0, 0.1), (1, 0.3), (2, 1.0), (3, 3.0)] {
         let options = SceneOptions { tracks: 105, outliers: 30.0 / 105.0, seed, ..SceneOptions::default() };
-        let (input, truth) = with_groups(options, &[Crowd { tracks: 100, jitter_px }]);
+        let (input, truth) = with_groups(options, &[WrongGroup { tracks: 100, jitter_px }]);
         let solution = by_geometry(&input);
         let f1 = agreement(&solution.tracks.inlier, &truth).f1;
         assert!(f1 > 0.97, "seed {seed}, jitter {jitter_px} px: F1 {f1}");
@@ -55,7 +55,7 @@ fn a_crowd_about_a_wrong_track_outvotes_no_right_ones() {
 fn groups_verify_no_more_than_a_track_each() {
     for seed in 0..3 {
         let options = SceneOptions { tracks: 40, outliers: 1.0, seed, ..SceneOptions::default() };
-        let groups = [Crowd { tracks: 60, jitter_px: 0.3 }, Crowd { tracks: 40, jitter_px: 1.0 }];
+        let groups = [WrongGroup { tracks: 60, jitter_px: 0.3 }, WrongGroup { tracks: 40, jitter_px: 1.0 }];
         let (input, _) = with_groups(options, &groups);
         let solution = by_geometry(&input);
         assert_eq!(solution.status, Status::NoReconstruction, "seed {seed}: {} inliers", solution.inlier_track_count());

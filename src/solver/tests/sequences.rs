@@ -329,11 +329,11 @@ fn views_of_a_zoom_that_do_not_turn_have_no_focal_length() {
     assert!(solution.warnings.iter().any(|warning| warning.detail == said), "{:?}", solution.warnings);
 }
 
-/// What an observer hears.
+/// Records what an observer gets.
 #[derive(Default)]
-struct Heard(Vec<Progress>);
+struct RecordedProgress(Vec<Progress>);
 
-impl Observer for Heard {
+impl Observer for RecordedProgress {
     fn progress(&mut self, progress: &Progress) {
         self.0.push(*progress);
     }
@@ -345,12 +345,13 @@ fn the_answer_does_not_depend_on_the_threads() {
     let sequence = Sequence::generate(&options).expect("valid");
     let input = input_of(&sequence);
     let on = |threads: usize| {
-        let (settings, stop, mut heard) = (SolveSettings::default(), StopToken::default(), Heard::default());
+        let (settings, stop, mut recorded) =
+            (SolveSettings::default(), StopToken::default(), RecordedProgress::default());
         let threads = crate::parallel::Threads::new(threads);
-        let mut solution = solve_on(threads, &input, &settings, &mut heard, &stop).expect("a solution");
+        let mut solution = solve_on(threads, &input, &settings, &mut recorded, &stop).expect("a solution");
         (solution.seconds, solution.stages, solution.proposal_times) = (0.0, Vec::new(), Vec::new());
         solution.history.iter_mut().for_each(|record| record.elapsed_seconds = 0.0);
-        assert!(heard.0.is_sorted_by_key(|progress| progress.fraction), "{threads:?}");
+        assert!(recorded.0.is_sorted_by_key(|progress| progress.fraction), "{threads:?}");
         solution
     };
     let alone = on(1);
@@ -364,17 +365,17 @@ fn the_answer_does_not_depend_on_the_threads() {
 fn progress_tells_the_views_and_what_is_done_with_them() {
     let options = SequenceOptions { tracks: 800, outliers: 0.3, seed: 0, ..SequenceOptions::default() };
     let sequence = Sequence::generate(&options).expect("valid");
-    let mut heard = Heard::default();
+    let mut recorded = RecordedProgress::default();
     let input = input_of(&sequence);
-    let solution = solve(&input, &SolveSettings::default(), &mut heard, &StopToken::default()).expect("a solution");
-    let records: Vec<ReconstructionProgress> = heard.0.iter().map(|progress| progress.reconstruction).collect();
+    let solution = solve(&input, &SolveSettings::default(), &mut recorded, &StopToken::default()).expect("a solution");
+    let records: Vec<ReconstructionProgress> = recorded.0.iter().map(|progress| progress.reconstruction).collect();
     for (before, after) in records.iter().zip(&records[1..]) {
         assert_eq!((after.views, after.blocks), (20, before.blocks), "{after:?}");
         let falls = after.block == before.block && after.registered_views < before.registered_views;
         assert!(!falls && after.block <= after.blocks, "{before:?} {after:?}");
     }
     assert_eq!(records[records.len() - 1].registered_views as usize, solution.registered_views().len());
-    // Records of each view that joins, and of each round; signs of life between them come and go with the machine.
+    // Records of each view that joins, and of each round; heartbeats between them come and go with the machine.
     let extending = solution.history.iter().filter(|record| record.stage == Stage::Extend);
     let told: std::collections::BTreeSet<u32> =
         extending.map(|record| record.reconstruction.registered_views).collect();

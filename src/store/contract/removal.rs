@@ -49,8 +49,8 @@ pub(in crate::store) async fn what_waits_or_runs_is_not_deleted(store: &dyn Stor
     assert_eq!(store.delete_job(&name, None).await, Err(Error::NotEnded(name.clone(), JobState::Running)));
     assert_eq!(store.purge(time(1_000_000), 10).await, Ok(0));
     store.finish(&lease, &success(vec![1]), time(2)).await.expect("still there");
-    let stranger = JobName { tenant: "u".into(), ..name.clone() };
-    assert_eq!(store.delete_job(&stranger, None).await, Err(Error::NotFound(stranger.clone())));
+    let other = JobName { tenant: "u".into(), ..name.clone() };
+    assert_eq!(store.delete_job(&other, None).await, Err(Error::NotFound(other.clone())));
     store.delete_job(&name, None).await.expect("deletes");
     assert_eq!(store.heartbeat(&lease, time(3), LEASE).await, Err(Error::Fenced(lease)));
 }

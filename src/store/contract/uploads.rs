@@ -100,9 +100,9 @@ pub(in crate::store) async fn an_upload_goes_on_where_it_ended_and_becomes_an_in
     assert_eq!(again, Ok(BegunUpload::Finished(expected)));
     let late = store.append_upload(&lease, upload.bytes, &[1], time(5)).await;
     assert_eq!(late, Err(Error::UploadTakenOver(upload.name.clone())));
-    let stranger = InputName { tenant: "u".into(), ..upload.name.clone() };
-    assert_eq!(store.upload(&stranger).await, Err(Error::UploadNotFound(stranger.clone())));
-    assert_eq!(store.uploaded_input(&stranger).await, Err(Error::InputNotFound(stranger)));
+    let foreign = InputName { tenant: "u".into(), ..upload.name.clone() };
+    assert_eq!(store.upload(&foreign).await, Err(Error::UploadNotFound(foreign.clone())));
+    assert_eq!(store.uploaded_input(&foreign).await, Err(Error::InputNotFound(foreign)));
 }
 
 pub(in crate::store) async fn the_latest_stream_has_the_upload(store: &dyn Store) {
@@ -218,9 +218,9 @@ pub(in crate::store) async fn an_input_lives_as_long_as_a_job_has_it(store: &dyn
     assert_eq!(store.queue_stats().await.expect("counts").queued_bytes, 100);
     let missing = store.create_job(of("c", "none"), &ROOM, time(5)).await;
     assert_eq!(missing.expect_err("no such input"), Error::InputNotFound(name("none")));
-    let mut stranger = of("c", "used");
-    stranger.name.tenant = "u".into();
-    let theirs = store.create_job(stranger, &ROOM, time(5)).await;
+    let mut foreign = of("c", "used");
+    foreign.name.tenant = "u".into();
+    let theirs = store.create_job(foreign, &ROOM, time(5)).await;
     assert!(matches!(theirs, Err(Error::InputNotFound(_))), "another tenant's");
     assert!(matches!(store.job(&record("c").name).await, Err(Error::NotFound(_))), "nothing was stored");
     // A repeated request neither needs the input again nor takes it away.
@@ -288,8 +288,8 @@ pub(in crate::store) async fn a_deleted_input_is_kept_by_its_jobs_alone(store: &
     }
     let of = |job: &str| NewRecord { input: JobInput::Uploaded { input: "shared".into(), bytes: 50 }, ..record(job) };
     let (a, b) = (create(store, of("a"), 1).await.name, create(store, of("b"), 1).await.name);
-    let stranger = InputName { tenant: "u".into(), input: "shared".into() };
-    assert_eq!(store.delete_input(&stranger).await, Err(Error::InputNotFound(stranger.clone())));
+    let foreign = InputName { tenant: "u".into(), input: "shared".into() };
+    assert_eq!(store.delete_input(&foreign).await, Err(Error::InputNotFound(foreign.clone())));
     for input in ["shared", "free"] {
         store.delete_input(&name(input)).await.expect("deletes");
         assert_eq!(store.delete_input(&name(input)).await, Err(Error::InputNotFound(name(input))));

@@ -31,7 +31,7 @@ const CONNECTIONS: u32 = 6;
 /// Connections for inputs and results of callers. Apart, since each may take half a minute, and no lease may be lost
 /// because its heartbeat waits behind uploads.
 const PAYLOAD_CONNECTIONS: u32 = 3;
-/// How long a caller waits for a connection. Callers are told soon that the database is away, before their patience or
+/// How long a caller waits for a connection. Callers are told soon that the database is away, before their timeout or
 /// a worker's lease is over.
 const ACQUIRE_TIMEOUT: Duration = Duration::from_secs(3);
 /// How long an operation on a few rows may take: what takes longer waits for a database that does not answer.

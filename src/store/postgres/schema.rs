@@ -15,14 +15,14 @@ const MIGRATIONS: [Step; 1] = [(1, "schema", include_str!("../migrations/postgre
 
 /// How long a server waits for another one that is at the schema: a step that goes through some ten million jobs takes
 /// minutes. Then it ends, and whoever started it may start it again.
-const PATIENCE: Duration = Duration::from_secs(15 * 60);
+const SCHEMA_LOCK_TIMEOUT: Duration = Duration::from_secs(15 * 60);
 
 /// Between two lines that say that it waits.
-const TOLD_EVERY: Duration = Duration::from_secs(5);
+const LOG_PERIOD: Duration = Duration::from_secs(5);
 
 /// How long a step waits for a table, all of whose users wait behind it: as long as the longest statement of a server.
 /// Only others, such as a backup, hold one for longer.
-const TABLE_PATIENCE: Duration = Duration::from_secs(30);
+const TABLE_LOCK_TIMEOUT: Duration = Duration::from_secs(30);
 
 /// What a wait for a lock ends with that took too long (PostgreSQL, appendix A: `lock_not_available`).
 const LOCK_NOT_AVAILABLE: &str = "55P03";
@@ -33,16 +33,16 @@ const LOCK_NOT_AVAILABLE: &str = "55P03";
 /// [`Error::Unavailable`] where the database refuses, or another server takes too long; [`Error::Corrupt`] where its
 /// schema is of a newer version.
 pub(super) async fn update(options: &PgConnectOptions) -> Result<(), Error> {
-    migrate(options, &MIGRATIONS, PATIENCE).await
+    migrate(options, &MIGRATIONS, SCHEMA_LOCK_TIMEOUT).await
 }
 
-async fn migrate(options: &PgConnectOptions, steps: &[Step], patience: Duration) -> Result<(), Error> {
+async fn migrate(options: &PgConnectOptions, steps: &[Step], lock_timeout: Duration) -> Result<(), Error> {
     // Of two values of a setting, the later one holds.
     let options = options.clone().options([("statement_timeout", "0")]);
     let connecting = <PgConnection as sqlx::Connection>::connect_with(&options);
     let mut connection = timeout(ACQUIRE_TIMEOUT, connecting).await.map_err(|_| sqlx::Error::PoolTimedOut)??;
-    lock(&mut connection, patience).await?;
-    bound_locks(&mut connection, TABLE_PATIENCE).await?;
+    lock(&mut connection, lock_timeout).await?;
+    bound_locks(&mut connection, TABLE_LOCK_TIMEOUT).await?;
     // The lock ends with the connection, however this does.
     let mut migrator = sql::migrator(steps);
     migrator.set_locking(false);
@@ -53,20 +53,20 @@ async fn migrate(options: &PgConnectOptions, steps: &[Step], patience: Duration)
 }
 
 /// Waits until no other server is at the schema, and keeps others from it. Says so while it waits.
-async fn lock(connection: &mut PgConnection, patience: Duration) -> Result<(), Error> {
-    bound_locks(connection, patience).await?;
+async fn lock(connection: &mut PgConnection, lock_timeout: Duration) -> Result<(), Error> {
+    bound_locks(connection, lock_timeout).await?;
     let too_long = || {
-        let seconds = patience.as_secs_f64();
+        let seconds = lock_timeout.as_secs_f64();
         Error::Unavailable(format!("waited {seconds} s for other servers that bring the schema up to date"))
     };
     let begun = Instant::now();
     let mut lock = connection.lock();
     loop {
-        match timeout(TOLD_EVERY, &mut lock).await {
+        match timeout(LOG_PERIOD, &mut lock).await {
             Ok(Err(error)) if is_late(&error) => return Err(too_long()),
             Ok(locked) => return locked.map_err(sql::migration_failed),
             // The database ends the wait by itself, unless it has gone away meanwhile.
-            Err(_) if begun.elapsed() > patience + ACQUIRE_TIMEOUT => return Err(too_long()),
+            Err(_) if begun.elapsed() > lock_timeout + ACQUIRE_TIMEOUT => return Err(too_long()),
             Err(_) => tracing::info!(
                 waited_seconds = begun.elapsed().as_secs(),
                 "waiting for another server that brings the schema up to date"
@@ -113,7 +113,7 @@ mod tests {
         let sleep = "SELECT pg_sleep(0.5)";
         let statement = connected(&options).await.rows(Statement::new(sleep)).await;
         assert!(statement.is_err(), "a caller's is ended");
-        migrate(&options, &[(1, "slow", sleep)], PATIENCE).await.expect("takes its time");
+        migrate(&options, &[(1, "slow", sleep)], SCHEMA_LOCK_TIMEOUT).await.expect("takes its time");
         let mut connection = connected(&options).await;
         let done = connection.rows(Statement::new("SELECT version FROM _sqlx_migrations")).await.expect("a table");
         assert_eq!(done.iter().map(|row| row.integer("version")).collect::<Vec<_>>(), [Ok(1)]);
@@ -129,7 +129,7 @@ mod tests {
         let expected = "waited 0.3 s for other servers that bring the schema up to date";
         assert_eq!(error, Error::Unavailable(expected.into()));
         // One that waits goes on once the other is through.
-        let waiting = migrate(&options, &MIGRATIONS, PATIENCE);
+        let waiting = migrate(&options, &MIGRATIONS, SCHEMA_LOCK_TIMEOUT);
         let unlocking = async {
             let waiters = "SELECT COUNT(*) AS count FROM pg_locks WHERE locktype = 'advisory' AND NOT granted \
                            AND database = (SELECT oid FROM pg_database WHERE datname = current_database())";
@@ -143,6 +143,8 @@ mod tests {
         };
         let (migrated, ()) = tokio::join!(waiting, unlocking);
         migrated.expect("up to date");
-        migrate(&options, &MIGRATIONS, PATIENCE).await.expect("nothing is left to do, and nobody holds the lock");
+        migrate(&options, &MIGRATIONS, SCHEMA_LOCK_TIMEOUT)
+            .await
+            .expect("nothing is left to do, and nobody holds the lock");
     }
 }

@@ -2,7 +2,7 @@
 
 use std::time::SystemTime;
 
-use super::jobs::{self, Waiting};
+use super::jobs::{self, AdmissionStats};
 use super::removal::check_etag;
 use super::rows::{self, Transition, locked_job, micros, number, returning_job};
 use super::{Change, Connection, Lock, Row, Statement, webhooks};
@@ -31,7 +31,7 @@ pub(super) async fn retry<C: Connection>(
     }
     let size = Statement::new("SELECT input_bytes, observation_count FROM jobs WHERE id = $1").bind(job.id);
     let size = connection.row(size).await?;
-    let (whole, tenant) = Waiting::default().look(connection, &name.tenant, bounds).await?;
+    let (whole, tenant) = AdmissionStats::default().look(connection, &name.tenant, bounds).await?;
     if let Some(bound) =
         bounds.refuses(&whole, &tenant, number(&size, "input_bytes")?, number(&size, "observation_count")?)
     {

@@ -167,11 +167,11 @@ async fn prefetch<C: Connection>(
     claimed(&connection.row(lease).await?, 1).map(Some)
 }
 
-/// A job with its lease, from a row of all its columns. `ahead`: attempts that are to be begun before the lease's.
-fn claimed(row: &impl Row, ahead: u32) -> Result<Claimed, Error> {
+/// A job with its lease, from a row of all its columns. `earlier`: attempts that are to be begun before the lease's.
+fn claimed(row: &impl Row, earlier: u32) -> Result<Claimed, Error> {
     let job = rows::job(row)?;
     Ok(Claimed {
-        lease: Lease { name: job.name.clone(), attempt: job.attempt + ahead },
+        lease: Lease { name: job.name.clone(), attempt: job.attempt + earlier },
         job,
         trace_parent: row.optional_text("trace_parent")?,
         queue_time: rows::time(row.integer("queue_time")?),

@@ -23,7 +23,7 @@ pub(super) async fn create<C: Connection>(
     now: SystemTime,
 ) -> Result<Vec<Created>, Error> {
     check_size(connection, news, bounds).await?;
-    let mut waiting = Waiting::default();
+    let mut stats = AdmissionStats::default();
     let mut inputs = vec![None; news.len()];
     if !C::WRITES_ALONE {
         // Before anything else, and each name once: two batches of the same inputs in other orders would wait for each
@@ -31,17 +31,17 @@ pub(super) async fn create<C: Connection>(
         uploads::lock(connection, &news.iter().filter_map(uploaded).collect()).await?;
         for (new, input) in news.iter().zip(&mut inputs) {
             // Payloads take long: nobody else's admission waits for them.
-            if admit(connection, new, bounds, &mut waiting).await?.is_none() {
+            if admit(connection, new, bounds, &mut stats).await?.is_none() {
                 *input = Some(input_of(connection, new, now).await?);
             }
         }
         connection.take_lock(Lock::Admission).await?;
         // Looked over again below: others may have come in between.
-        waiting = Waiting::default();
+        stats = AdmissionStats::default();
     }
     let mut created = Vec::new();
     for (new, input) in news.iter().zip(inputs) {
-        match admit(connection, new, bounds, &mut waiting).await? {
+        match admit(connection, new, bounds, &mut stats).await? {
             Some(job) => {
                 if let Some(input) = input {
                     let delete = Statement::new("DELETE FROM inputs WHERE id = $1 AND input IS NULL");
@@ -55,7 +55,7 @@ pub(super) async fn create<C: Connection>(
                     None => input_of(connection, new, now).await?,
                 };
                 created.push(Created { job: enqueue(connection, new, input, now).await?, new: true });
-                waiting.add(new);
+                stats.add(new);
             }
         }
     }
@@ -90,12 +90,12 @@ async fn check_size<C: Connection>(connection: &mut C, news: &[NewRecord], bound
 
 /// What waits, as admission needs it: summed up once a batch, since a sum goes through the whole queue.
 #[derive(Default)]
-pub(super) struct Waiting {
+pub(super) struct AdmissionStats {
     whole: Option<QueueStats>,
     tenants: HashMap<String, QueueStats>,
 }
 
-impl Waiting {
+impl AdmissionStats {
     /// What waits of all tenants, and of this one where it has bounds of its own.
     pub(super) async fn look<C: Connection>(
         &mut self,
@@ -169,7 +169,7 @@ async fn admit<C: Connection>(
     connection: &mut C,
     new: &NewRecord,
     bounds: &QueueBounds,
-    waiting: &mut Waiting,
+    stats: &mut AdmissionStats,
 ) -> Result<Option<Job>, Error> {
     if let Some(request) = &new.request
         && let Some(job) = earlier(connection, &new.name.tenant, request).await?
@@ -182,7 +182,7 @@ async fn admit<C: Connection>(
     if connection.row(taken).await?.flag("taken")? {
         return Err(Error::AlreadyExists(TakenId::Job(new.name.clone())));
     }
-    let (whole, tenant) = waiting.look(connection, &new.name.tenant, bounds).await?;
+    let (whole, tenant) = stats.look(connection, &new.name.tenant, bounds).await?;
     match bounds.refuses(&whole, &tenant, new.input.bytes(), u64::from(new.observation_count)) {
         Some(bound) => Err(Error::QueueFull(bound)),
         None => Ok(None),

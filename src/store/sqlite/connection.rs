@@ -67,8 +67,8 @@ impl WriteConnection {
     }
 
     /// How long a statement waits for others on the file.
-    pub(super) fn set_patience(&mut self, patience: Duration) -> Result<(), Error> {
-        Ok(self.inner.busy_timeout(patience)?)
+    pub(super) fn set_busy_timeout(&mut self, busy_timeout: Duration) -> Result<(), Error> {
+        Ok(self.inner.busy_timeout(busy_timeout)?)
     }
 
     /// The file.

@@ -165,7 +165,7 @@ async fn what_is_told_not_to_have_had_its_turn_is_not_run() {
     let fixture = Fixture::open().await.expect("opens");
     let (go, held) = fixture.hold().await;
     let mut impatient = fixture.writer.clone();
-    impatient.patience = Duration::from_millis(1);
+    impatient.turn_timeout = Duration::from_millis(1);
     let runs = Count::default();
     let outcome = impatient.write(WriteIntent::Little, counting(&runs)).await;
     assert!(matches!(&outcome, Err(Error::Unavailable(text)) if text.contains("no turn")), "{outcome:?}");
@@ -181,7 +181,7 @@ async fn what_can_be_done_another_time_does_not_wait_for_a_writer_that_hangs() {
     let fixture = Fixture::open().await.expect("opens");
     let (go, held) = fixture.hold().await;
     let mut impatient = fixture.writer.clone();
-    impatient.patience = Duration::from_millis(1);
+    impatient.turn_timeout = Duration::from_millis(1);
     for outcome in [impatient.shorten().await, impatient.vacuum_pays().await.map(|_| ())] {
         assert!(matches!(&outcome, Err(Error::Unavailable(text)) if text.contains("no turn")), "{outcome:?}");
     }

@@ -16,7 +16,7 @@ use crate::store::Error;
 pub(super) const LONG_PAGES: i64 = 1_000;
 
 /// How long a log that is to be cut waits for its readers; writers wait meanwhile.
-const CUT_PATIENCE: Duration = Duration::from_millis(200);
+const CUT_BUSY_TIMEOUT: Duration = Duration::from_millis(200);
 
 /// Pages of the log, and how many of them are in the database, too; nothing is moved.
 const LOOK: &str = "PRAGMA wal_checkpoint(NOOP)";
@@ -47,9 +47,9 @@ impl WriteConnection {
     /// Writes the log back and cuts it to nothing: its room is for others, too. Readers may keep it from that.
     pub(super) fn cut_log(&mut self) -> Result<Log, Error> {
         self.where_it_fits(|connection| {
-            connection.set_patience(CUT_PATIENCE)?;
+            connection.set_busy_timeout(CUT_BUSY_TIMEOUT)?;
             let cut = connection.first_row(CUT, |_| Ok(()));
-            connection.set_patience(BUSY_TIMEOUT)?;
+            connection.set_busy_timeout(BUSY_TIMEOUT)?;
             cut
         })
     }

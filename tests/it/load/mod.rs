@@ -1,5 +1,5 @@
 //! Many clients, jobs and watchers at once, and what the service costs beside the solve.
 
 mod clients;
-mod crowd;
 mod throughput;
+mod watchers;

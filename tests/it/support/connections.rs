@@ -21,8 +21,8 @@ pub async fn saying(address: &str, count: usize, words: &[u8]) -> Vec<TcpStream>
     connections
 }
 
-/// The address of a door to this one, and how many have come through it: a client connects again by itself, and says
-/// nothing of it.
+/// The address of a proxy of this one, and how many connections came through it: a client connects again by itself,
+/// and does not say so.
 pub async fn counting(address: SocketAddr) -> (String, Arc<AtomicUsize>) {
     let listener = TcpListener::bind("127.0.0.1:0").await.expect("a port");
     let url = format!("http://{}", listener.local_addr().expect("an address"));

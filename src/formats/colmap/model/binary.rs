@@ -4,7 +4,7 @@ use std::io::{BufRead, ErrorKind, Read};
 
 use super::super::cameras::{Camera, Model};
 use super::super::images::{Images, Observation};
-use super::{NO_POINT, Room};
+use super::{NO_POINT, ReadBounds};
 use crate::domain::Limits;
 use crate::domain::View;
 use crate::formats::error::{Error, Problem};
@@ -46,7 +46,7 @@ pub(super) fn images(
     limits: &Limits,
     images: &mut Images,
 ) -> Result<Vec<Observation>, Error> {
-    let room = Room::new(limits);
+    let bounds = ReadBounds::new(limits);
     let mut bytes = Bytes { reader, file, length, offset: 0, record: "the count of images".into() };
     let mut observations = Vec::new();
     for k in 0..bytes.count("images", IMAGE_BYTES)? {
@@ -66,9 +66,9 @@ pub(super) fn images(
             if track != NO_POINT {
                 observations.push(Observation { image, keypoint, track, x, y, line: 0 });
             }
-            room.check(images, &observations).map_err(|what| bytes.wrong_at(bytes.offset, what))?;
+            bounds.check(images, &observations).map_err(|what| bytes.wrong_at(bytes.offset, what))?;
         }
-        room.check(images, &observations).map_err(|what| bytes.wrong_at(start, what))?;
+        bounds.check(images, &observations).map_err(|what| bytes.wrong_at(start, what))?;
     }
     bytes.end()?;
     Ok(observations)

@@ -4,7 +4,7 @@ use std::io::BufRead;
 
 use super::super::cameras::{Camera, Model};
 use super::super::images::{Images, Observation};
-use super::Room;
+use super::ReadBounds;
 use crate::domain::Limits;
 use crate::formats::error::{Error, Problem};
 use crate::formats::text::{Lines, MAX_TABLE_LINE_BYTES, number, quote, whole};
@@ -55,7 +55,7 @@ pub(super) fn images(
     images: &mut Images,
 ) -> Result<Vec<Observation>, Error> {
     let one = |problem: Problem| Error::one(file, problem);
-    let room = Room::new(limits);
+    let bounds = ReadBounds::new(limits);
     let mut lines = Lines::new(reader, MAX_POINTS_LINE_BYTES);
     let mut observations = Vec::new();
     while lines.advance().map_err(one)? {
@@ -74,8 +74,8 @@ pub(super) fn images(
         }
         let line = lines.expect_text().map_err(one)?;
         let second = lines.number();
-        keypoints(line, image, second, room.most_observations, images, &mut observations)
-            .and_then(|()| room.check(images, &observations))
+        keypoints(line, image, second, bounds.most_observations, images, &mut observations)
+            .and_then(|()| bounds.check(images, &observations))
             .map_err(|what| wrong(second, what))?;
     }
     Ok(observations)

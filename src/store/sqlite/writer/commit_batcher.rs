@@ -6,7 +6,7 @@ use std::time::{Duration, Instant};
 use tokio::sync::mpsc;
 
 use super::Message;
-use super::pending::Waiting;
+use super::pending::PendingWrite;
 use crate::store::Error;
 use crate::store::sql::WriteIntent;
 use crate::store::sqlite::ballast::{BALLAST_BYTES, Ballast, RETRY};
@@ -33,7 +33,7 @@ pub(super) struct CommitBatcher {
 
 /// An operation of a group and what it came to: answered with that once the group is committed, also where it was
 /// refused, as it may have seen what the others had written.
-type Executed = (Box<dyn Waiting>, Result<(), Error>);
+type Executed = (Box<dyn PendingWrite>, Result<(), Error>);
 
 impl CommitBatcher {
     pub(super) fn new(
@@ -82,7 +82,7 @@ impl CommitBatcher {
 
     /// Runs operations until none waits, commits them together and answers them; a large one alone. Returns what it was
     /// handed and is no part of the group: a large operation, or what is none.
-    async fn group(&mut self, first: Box<dyn Waiting>) -> Option<Message> {
+    async fn group(&mut self, first: Box<dyn PendingWrite>) -> Option<Message> {
         // Here, and not where one is run again, for which the ballast was given up.
         if self.ballast.is_due() {
             self.cut_log();
@@ -128,7 +128,7 @@ impl CommitBatcher {
     }
 
     /// Begins a transaction with this operation; without one where it is refused.
-    async fn open(&mut self, operation: &mut dyn Waiting) -> Result<(), Error> {
+    async fn open(&mut self, operation: &mut dyn PendingWrite) -> Result<(), Error> {
         let mut result = self.control(BEGIN);
         if result.is_ok() {
             result = self.run(operation).await;
@@ -141,7 +141,7 @@ impl CommitBatcher {
 
     /// Runs an operation in the transaction of others, which stand whatever becomes of it. An error says that the
     /// transaction is lost.
-    async fn join(&mut self, operation: &mut dyn Waiting) -> Result<Result<(), Error>, Error> {
+    async fn join(&mut self, operation: &mut dyn PendingWrite) -> Result<Result<(), Error>, Error> {
         self.control("SAVEPOINT one")?;
         let outcome = self.run(operation).await;
         if let Err(error) = &outcome {
@@ -182,7 +182,7 @@ impl CommitBatcher {
     }
 
     /// Runs an operation in a transaction of its own.
-    async fn alone(&mut self, operation: &mut dyn Waiting) -> Result<(), Error> {
+    async fn alone(&mut self, operation: &mut dyn PendingWrite) -> Result<(), Error> {
         self.open(operation).await?;
         let committed = self.end(1);
         if committed.is_err() {
@@ -193,7 +193,7 @@ impl CommitBatcher {
 
     /// Gives the ballast up for an operation that found no room, and runs it again: one that begins something only once
     /// the log is cut and there is ballast beside it again.
-    async fn with_ballast(&mut self, operation: &mut dyn Waiting, error: Error) -> Result<(), Error> {
+    async fn with_ballast(&mut self, operation: &mut dyn PendingWrite, error: Error) -> Result<(), Error> {
         if !self.can_help(&error) || !self.ballast.give_up() {
             return Err(error);
         }
@@ -250,7 +250,7 @@ impl CommitBatcher {
 
     /// Runs an operation in the transaction that is open. Without ballast, what is left is for what ends what was
     /// begun: an operation that begins something is refused, unless it finds that it has nothing to write.
-    async fn run(&mut self, operation: &mut dyn Waiting) -> Result<(), Error> {
+    async fn run(&mut self, operation: &mut dyn PendingWrite) -> Result<(), Error> {
         let is_bound = matches!(operation.intent(), WriteIntent::Begins(_)) && !self.ballast.restore();
         let connection = self.connection()?;
         let before = connection.changes();

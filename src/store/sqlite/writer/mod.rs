@@ -17,14 +17,14 @@ use tokio::sync::{mpsc, oneshot};
 use tokio::time::timeout;
 
 use self::commit_batcher::CommitBatcher;
-use self::pending::{Pending, Waiting};
+use self::pending::{Pending, PendingWrite};
 use super::ballast::Ballast;
 use super::connection::{WriteConnection, WrittenRow};
 use crate::store::Error;
 use crate::store::sql::{self, Operation, Statement, WriteIntent};
 
 /// How long an operation waits for its turn; behind a queue of writes this long, the disk has failed.
-const PATIENCE: Duration = Duration::from_secs(60);
+const TURN_TIMEOUT: Duration = Duration::from_secs(60);
 
 /// How long a group goes on taking operations, each of [`LARGE_BYTES`] at most: about what a commit takes on a slow
 /// disk, so that the first of a group waits for the others about as long as for the disk.
@@ -39,12 +39,12 @@ pub(super) const LARGE_BYTES: u64 = 1 << 20;
 #[derive(Debug, Clone)]
 pub(super) struct Writer {
     inbox: mpsc::UnboundedSender<Message>,
-    /// [`PATIENCE`], but in tests.
-    pub(super) patience: Duration,
+    /// [`TURN_TIMEOUT`], but in tests.
+    pub(super) turn_timeout: Duration,
 }
 
 enum Message {
-    Write(Box<dyn Waiting>),
+    Write(Box<dyn PendingWrite>),
     VacuumPays(oneshot::Sender<Result<bool, Error>>),
     Shorten(oneshot::Sender<()>),
     Close(oneshot::Sender<()>),
@@ -70,7 +70,7 @@ impl Writer {
         let commit_batcher = CommitBatcher::new(connection, database, ballast, messages, group_time);
         let work = move || runtime.block_on(commit_batcher.serve());
         thread::Builder::new().name("store-writer".into()).spawn(work).map_err(failed)?;
-        Ok(Self { inbox, patience: PATIENCE })
+        Ok(Self { inbox, turn_timeout: TURN_TIMEOUT })
     }
 
     /// Runs an operation and answers once what it wrote is on the disk.
@@ -83,10 +83,10 @@ impl Writer {
         let closed = || Error::Unavailable("the store is closed".into());
         self.inbox.send(Message::Write(Box::new(pending))).map_err(|_| closed())?;
         loop {
-            match timeout(self.patience, &mut answer).await {
+            match timeout(self.turn_timeout, &mut answer).await {
                 Ok(answered) => return answered.unwrap_or_else(|_| Err(closed())),
                 Err(_) if turn.give_up() => {
-                    return Err(no_turn(self.patience));
+                    return Err(no_turn(self.turn_timeout));
                 }
                 // What has begun ends, sooner or later, and whether it came to anything is known only then.
                 Err(_) => {}
@@ -121,9 +121,9 @@ impl Writer {
 
     /// Has something done that can as well be done another time.
     async fn ask<T>(&self, message: fn(oneshot::Sender<T>) -> Message) -> Result<T, Error> {
-        match timeout(self.patience, self.send(message)).await {
+        match timeout(self.turn_timeout, self.send(message)).await {
             Ok(answer) => answer,
-            Err(_) => Err(no_turn(self.patience)),
+            Err(_) => Err(no_turn(self.turn_timeout)),
         }
     }
 
@@ -136,6 +136,6 @@ impl Writer {
     }
 }
 
-fn no_turn(patience: Duration) -> Error {
-    Error::Unavailable(format!("no turn to write came within {} s", patience.as_secs_f64()))
+fn no_turn(turn_timeout: Duration) -> Error {
+    Error::Unavailable(format!("no turn to write came within {} s", turn_timeout.as_secs_f64()))
 }

@@ -13,7 +13,7 @@ use crate::store::Error;
 use crate::store::sql::{Operation, WriteIntent};
 
 /// An operation that waits for its turn, whatever it answers.
-pub(super) trait Waiting: Send {
+pub(super) trait PendingWrite: Send {
     /// Marks it as begun; `false` where its caller is gone, and nobody wants it any more.
     fn begins(&self) -> bool;
 
@@ -75,7 +75,7 @@ impl<T> Pending<T> {
     }
 }
 
-impl<T: Send + 'static> Waiting for Pending<T> {
+impl<T: Send + 'static> PendingWrite for Pending<T> {
     fn begins(&self) -> bool {
         self.turn.begin() && !self.reply.is_closed()
     }

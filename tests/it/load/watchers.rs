@@ -31,7 +31,7 @@ const WATCHERS_A_CONNECTION: usize = 100;
 const SLOW_EVERY: usize = 20;
 
 /// So many watchers, each of a job of its own, and so many jobs in all.
-struct Crowd {
+struct WatcherLoad {
     watchers: usize,
     jobs: usize,
     /// Makes the request of this number.
@@ -106,9 +106,9 @@ async fn watch_all(server: &Serving, names: &[String], slow_pause: Option<Durati
     (fast, slow)
 }
 
-impl Crowd {
+impl WatcherLoad {
     /// Runs until every watcher is through; the rest of the queue is left to the end of the server.
-    async fn meet(self) {
+    async fn run(self) {
         let directory = tempfile::tempdir().expect("a temporary directory");
         let data_dir = directory.path().join("data");
         let queue = (self.jobs + 1).to_string();
@@ -166,12 +166,12 @@ impl Crowd {
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn a_hundred_watchers_of_a_long_queue_see_everything_though_some_do_not_read() {
-    Crowd { watchers: 100, jobs: 500, request: |_| create_tracks(), slow_pause: None }.meet().await;
+    WatcherLoad { watchers: 100, jobs: 500, request: |_| create_tracks(), slow_pause: None }.run().await;
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-#[ignore = "takes minutes, and its figures want an optimised SCPSFM_PROGRAM: cargo test --test it crowd -- --ignored"]
+#[ignore = "takes minutes, and needs an optimised SCPSFM_PROGRAM: cargo test --test it watchers -- --ignored"]
 async fn a_thousand_watchers_of_ten_thousand_jobs_see_everything_though_some_are_slow() {
     let slow_pause = Some(Duration::from_secs(1));
-    Crowd { watchers: 1_000, jobs: 10_000, request: tiny, slow_pause }.meet().await;
+    WatcherLoad { watchers: 1_000, jobs: 10_000, request: tiny, slow_pause }.run().await;
 }
