@@ -43,8 +43,8 @@ fn main() -> Result<(), Box<dyn Error>> {
     Ok(())
 }
 
-/// Says of each array of numbers that it is packed, as it is by default in proto3: prost takes any option of a field, such
-/// as its field_behavior, to say that it is not.
+/// Says of each array of numbers that it is packed, as it is by default in proto3: prost takes any option of a field,
+/// such as its field_behavior, to say that it is not.
 fn pack(files: &mut FileDescriptorSet) {
     let mut messages: Vec<&mut DescriptorProto> =
         files.file.iter_mut().flat_map(|file| &mut file.message_type).collect();

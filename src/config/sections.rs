@@ -99,14 +99,19 @@ impl Http {
     /// Whether the origins are what a browser calls a page's.
     pub(super) fn validate(&self) -> Result<(), Error> {
         let is_origin = |text: &str| {
-            let authority = text.strip_prefix("https://").or_else(|| text.strip_prefix("http://"));
-            authority.is_some_and(|authority| !authority.contains(['*', '@']) && authority.parse::<Authority>().is_ok())
+            let Some((scheme @ ("http" | "https"), authority)) = text.split_once("://") else { return false };
+            // A browser leaves the port of the scheme out, so that an origin with it would never be met.
+            let is_default_port = |port| matches!((scheme, port), ("http", 80) | ("https", 443));
+            let parsed = authority.parse::<Authority>();
+            !authority.contains(['*', '@'])
+                && parsed.is_ok_and(|authority| !authority.port_u16().is_some_and(is_default_port))
         };
         match self.allowed_origins().into_iter().find(|origin| !is_origin(origin)) {
             Some(wrong) => Err(Error::Value {
                 key: "http.allowed_origins",
                 found: format!("`{wrong}`"),
-                right: "origins of pages without a path, such as `https://app.example`, separated by commas",
+                right: "origins of pages as browsers write them, without a path and without port 443 of https and 80 of http, such \
+                        as `https://app.example`, separated by commas",
             }),
             None => Ok(()),
         }

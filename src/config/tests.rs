@@ -165,6 +165,7 @@ fn errors_name_the_key_and_what_would_be_right() {
         (from_variable("SCPSFM_WEBHOOKS_SECRET", "hunter2"), &["SCPSFM_WEBHOOKS_SECRET", "SCPSFM_WEBHOOKS__SECRET"]),
         (from_file("[http]\nallowed_origins = \"*\"\n"), &["http.allowed_origins", "`*`", "https://app.example"]),
         (from_variable("SCPSFM_HTTP__ALLOWED_ORIGINS", "https://a.example, https://b.example/x"), &["b.example/x"]),
+        (from_variable("SCPSFM_HTTP__ALLOWED_ORIGINS", "https://a.example:443"), &["a.example:443", "port 443"]),
         (from_file("[tls]\ncertificate = \"c\"\n"), &["tls.certificate", "tls.key"]),
         (from_file("[tls]\nclient_ca = \"c\"\n"), &["tls.client_ca", "tls.certificate"]),
         (from_file("[server]\nlisten = \"0.0.0.0:1\"\n"), &["server.listen", "--tls-certificate", "--insecure"]),

@@ -87,16 +87,16 @@ impl InvalidInput {
 }
 
 /// What is collected in a [`Listing`].
-pub trait Complaint {
+pub trait Groupable {
     /// Whether both say the same of other values.
-    fn is_like(&self, other: &Self) -> bool;
+    fn is_same_kind(&self, other: &Self) -> bool;
 
     /// Adds to the description.
     fn append(&mut self, text: &str);
 }
 
-impl Complaint for Violation {
-    fn is_like(&self, other: &Self) -> bool {
+impl Groupable for Violation {
+    fn is_same_kind(&self, other: &Self) -> bool {
         self.field == other.field && are_alike(&self.description, &other.description)
     }
 
@@ -115,7 +115,7 @@ pub fn are_alike(one: &str, other: &str) -> bool {
     words(one).eq(words(other))
 }
 
-/// Lists complaints: of each kind the first few and a count, so that a thousand of one kind hide none of another.
+/// Lists problems: of each kind the first few and a count, so that a thousand of one kind hide none of another.
 #[derive(Debug)]
 pub struct Listing<T> {
     listed: Vec<T>,
@@ -124,7 +124,7 @@ pub struct Listing<T> {
     unlisted: usize,
 }
 
-/// Complaints of one kind: places in the list, and how many there were.
+/// Problems of one kind: places in the list, and how many there were.
 #[derive(Debug)]
 struct Kind {
     first: usize,
@@ -139,15 +139,15 @@ impl<T> Default for Listing<T> {
     }
 }
 
-impl<T: Complaint> Listing<T> {
-    /// Complaints of one kind that are listed one by one: enough to see what they have in common.
+impl<T: Groupable> Listing<T> {
+    /// Problems of one kind that are listed one by one: enough to see what they have in common.
     pub const MAX_ALIKE: usize = 3;
 
     /// Adds one.
-    pub fn push(&mut self, complaint: T) {
+    pub fn push(&mut self, problem: T) {
         let is_full = self.listed.len() >= InvalidInput::MAX_LISTED;
         let place = self.listed.len();
-        match self.kinds.iter_mut().find(|kind| self.listed[kind.first].is_like(&complaint)) {
+        match self.kinds.iter_mut().find(|kind| self.listed[kind.first].is_same_kind(&problem)) {
             Some(kind) if is_full || kind.count >= Self::MAX_ALIKE => {
                 kind.unlisted += 1;
                 return;
@@ -159,7 +159,7 @@ impl<T: Complaint> Listing<T> {
             }
             None => self.kinds.push(Kind { first: place, last: place, count: 1, unlisted: 0 }),
         }
-        self.listed.push(complaint);
+        self.listed.push(problem);
     }
 
     /// Counts some that someone else already left unlisted.

@@ -45,7 +45,7 @@ pub struct Joined {
 /// A match in the order in which matches are taken: by support, size of the pair and keypoints.
 type Ranked = (Reverse<u16>, Reverse<u32>, u32, u32);
 
-/// Joins matches, in O(E log E) for E matches. Which end of a match is `a` does not matter, nor the order of the
+/// Joins matches, in O(E (log E + V / 64)) for E matches of V images. Which end of a match is `a` does not matter, nor the order of the
 /// matches.
 ///
 /// * `image_of`: image of a keypoint, ascending with the keypoint
@@ -128,13 +128,21 @@ impl Graph {
 /// Disjoint sets of keypoints, each with at most one keypoint an image.
 struct Components {
     parents: Vec<u32>,
-    /// Images of a root's component, ascending.
-    images: Vec<Vec<u32>>,
+    /// Images of a root's component.
+    images: Vec<ImageSet>,
+}
+
+/// Set of images: words of 64 images that are not empty, with their numbers, ascending. A component of thousands of
+/// images may be tried against thousands of others, which is a few dozen words each.
+type ImageSet = Vec<(u32, u64)>;
+
+fn size(images: &[(u32, u64)]) -> u32 {
+    images.iter().map(|(_, bits)| bits.count_ones()).sum()
 }
 
 impl Components {
     fn new(images: impl Iterator<Item = u32>) -> Self {
-        let images: Vec<Vec<u32>> = images.map(|image| vec![image]).collect();
+        let images: Vec<ImageSet> = images.map(|image| vec![(image / 64, 1 << (image % 64))]).collect();
         Self { parents: (0..images.len() as u32).collect(), images }
     }
 
@@ -154,7 +162,10 @@ impl Components {
         if few.len() > many.len() {
             std::mem::swap(&mut few, &mut many);
         }
-        !few.iter().any(|image| many.binary_search(image).is_ok())
+        few.iter().all(|&(word, bits)| match many.binary_search_by_key(&word, |&(word, _)| word) {
+            Ok(place) => many[place].1 & bits == 0,
+            Err(_) => true,
+        })
     }
 
     /// Joins the components that are each other's best, by the number of matches between them and then by the size of
@@ -195,14 +206,21 @@ impl Components {
         if !self.are_disjoint(a, b) {
             return false;
         }
-        let is_larger = self.images[a as usize].len() >= self.images[b as usize].len();
+        let is_larger = size(&self.images[a as usize]) >= size(&self.images[b as usize]);
         let (large, small) = if is_larger { (a, b) } else { (b, a) };
         let moved = std::mem::take(&mut self.images[small as usize]);
         self.parents[small as usize] = large;
         let images = &mut self.images[large as usize];
         images.extend(moved);
         // Two ascending runs: the sort finds and merges them.
-        images.sort();
+        images.sort_unstable();
+        images.dedup_by(|next, kept| {
+            let is_same = next.0 == kept.0;
+            if is_same {
+                kept.1 |= next.1;
+            }
+            is_same
+        });
         true
     }
 
@@ -214,7 +232,7 @@ impl Components {
         let mut observations = Vec::new();
         for (place, &keypoint) in keypoints.iter().enumerate() {
             let root = self.root(place as u32) as usize;
-            if self.images[root].len() < 2 {
+            if size(&self.images[root]) < 2 {
                 continue;
             }
             if track_of_root[root] == NONE {

@@ -51,9 +51,15 @@ impl Webhook {
         Self { url: url.into(), state: WebhookState::Pending, attempts: 0, last_error: None }
     }
 
-    /// The receiver: scheme, host and port of the URL.
+    /// The receiver as it is shown: scheme, host and port of the URL.
     pub fn receiver(&self) -> String {
         Url::parse(&self.url).map_or_else(|_| self.url.clone(), |url| url.origin().ascii_serialization())
+    }
+
+    /// The host of the URL, to which attempts are bounded.
+    pub fn host(&self) -> String {
+        let url = Url::parse(&self.url).ok();
+        url.and_then(|url| url.host_str().map(str::to_owned)).unwrap_or_else(|| self.url.clone())
     }
 
     /// A URL that a job may name.
@@ -123,5 +129,10 @@ mod tests {
         let receiver = |url: &str| Webhook::pending(url).receiver();
         assert_eq!(receiver("https://Hooks.example:443/a?b=c"), "https://hooks.example");
         assert_eq!(receiver("http://[::1]:81/a"), "http://[::1]:81");
+        let host = |url: &str| Webhook::pending(url).host();
+        assert_eq!(
+            (host("https://Hooks.example:81/a"), host("http://[::1]:81/a")),
+            ("hooks.example".into(), "[::1]".into())
+        );
     }
 }

@@ -1,7 +1,5 @@
 //! What operators ask for: retries, priorities, pauses of the queue, a drain.
 
-use std::time::SystemTime;
-
 use super::{Engine, Error, Inner, Phase, QueueReport, finished, observe};
 use crate::domain::job::{Job, JobName};
 use crate::store;
@@ -44,7 +42,7 @@ impl Engine {
     }
 
     async fn set_paused(&self, paused: bool) -> Result<(), Error> {
-        self.inner.store.set_paused(paused, SystemTime::now()).await?;
+        self.inner.store.set_paused(paused, self.inner.now()).await?;
         self.inner.work_waits();
         // The count of the queue tells of the change.
         self.inner.queue_changed();
@@ -76,7 +74,7 @@ impl Inner {
             observe::refused(observe::Refusal::Draining);
             return Err(Error::Draining);
         }
-        let retried = self.store.retry_job(name, etag, &self.options.queue, SystemTime::now()).await;
+        let retried = self.store.retry_job(name, etag, &self.options.queue, self.now()).await;
         if let Err(store::Error::QueueFull(bound)) = &retried {
             observe::refused(observe::Refusal::QueueFull(bound.quota()));
         }

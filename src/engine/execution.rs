@@ -187,7 +187,7 @@ impl JobExecution {
                 Err(verdict) => return Err(Finished { execution: self, verdict, latest: None }),
             };
             let subscription = self.inner.notifier.subscribe(&self.job.name);
-            // Weights of an attempt before this one are nobody's any more.
+            // Weights of an earlier attempt are out of date.
             subscription.channel().weights.send_replace(None);
             let assignment = Assignment {
                 name: self.job.name.clone(),
@@ -419,7 +419,7 @@ impl Loaded {
         let claims = execution.inner.claim(Some(prefetched), now).instrument(begun.span.clone()).await;
         let Some(claimed) = claims.begun else {
             execution.lapse();
-            // Until then the worker is not free. What it answers is nobody's.
+            // Until then the worker is not free. Its outcome is dropped.
             let _ = handle.report.await;
             return None;
         };

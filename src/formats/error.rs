@@ -2,7 +2,7 @@
 
 use std::fmt;
 
-use crate::domain::error::{Complaint, Listing, are_alike};
+use crate::domain::error::{Groupable, Listing, are_alike};
 
 /// Where in a file.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -118,8 +118,8 @@ impl fmt::Display for Error {
     }
 }
 
-impl Complaint for Problem {
-    fn is_like(&self, other: &Self) -> bool {
+impl Groupable for Problem {
+    fn is_same_kind(&self, other: &Self) -> bool {
         are_alike(&self.column, &other.column) && are_alike(&self.description, &other.description)
     }
 

@@ -7,7 +7,7 @@ use super::convert::enums::Twin;
 use super::{proto, status};
 use crate::engine::{Engine, QueueReport, TenantQueue};
 
-/// Tenants that the queue is told of, as the API says: those that crowd it.
+/// Tenants that GetQueue lists, as the API says: those with most jobs.
 const MAX_TENANTS: u32 = 20;
 
 /// The service.
@@ -35,7 +35,7 @@ impl proto::admin_service_server::AdminService for Admin {
 
     async fn pause_queue(&self, request: Request<proto::PauseQueueRequest>) -> Result<Response<proto::Queue>, Status> {
         let (caller, engine) = (Caller::of(&request)?, self.engine.clone());
-        let work = async move { engine.pause().await.map(drop).map_err(status::from_engine) };
+        let work = async move { engine.pause().await.map_err(status::from_engine) };
         caller.audited("PauseQueue", "queue", work).await?;
         self.queue().await
     }
@@ -45,7 +45,7 @@ impl proto::admin_service_server::AdminService for Admin {
         request: Request<proto::ResumeQueueRequest>,
     ) -> Result<Response<proto::Queue>, Status> {
         let (caller, engine) = (Caller::of(&request)?, self.engine.clone());
-        let work = async move { engine.resume().await.map(drop).map_err(status::from_engine) };
+        let work = async move { engine.resume().await.map_err(status::from_engine) };
         caller.audited("ResumeQueue", "queue", work).await?;
         self.queue().await
     }

@@ -228,7 +228,11 @@ impl proto::job_service_server::JobService for Jobs {
         let name = caller.job(&request.get_ref().name)?;
         let etag = Some(request.into_inner().etag).filter(|etag| !etag.is_empty());
         let (engine, resource) = (self.engine.clone(), name.clone());
-        let retry = async move { engine.retry(&name, etag).await.map_err(status::from_engine) };
+        let counted = caller.count_jobs(1);
+        let retry = async move {
+            counted?;
+            engine.retry(&name, etag).await.map_err(status::from_engine)
+        };
         let retried = caller.audited("RetryJob", resource, retry).await?;
         Ok(Response::new(job::to_wire(&retried)))
     }

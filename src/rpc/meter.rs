@@ -1,6 +1,5 @@
 //! Counts every call by method and status code, from the request's headers to the last byte of its answer, and writes
-//! it down: a line a call in the access log, and refusals in the log, of which anyone can cause many and few are
-//! logged.
+//! it down: a line a call in the access log, and refusals in the log, at most ten a minute for each code.
 
 use std::net::SocketAddr;
 use std::pin::Pin;

@@ -74,7 +74,9 @@ impl Submission {
                 let field = match message {
                     Message::TrackSetChunk(_) => "track_set_chunk",
                     Message::MeasurementMatrixChunk(_) => "measurement_matrix_chunk",
-                    Message::MatchSetChunk(_) | Message::Config(_) => "match_set_chunk",
+                    Message::MatchSetChunk(_) => "match_set_chunk",
+                    // Refused above.
+                    Message::Config(_) => "config",
                 };
                 Err(super::violation(field, "the config names an uploaded input"))
             }

@@ -5,8 +5,8 @@ use std::time::{Duration, SystemTime};
 
 use super::{
     BegunUpload, CancelReply, Claim, Claims, Created, EncodedResult, Ending, Error, Heartbeat, InputPage, InputQuery,
-    JobPage, JobPayload, JobQuery, Lease, NewInput, NewRecord, NewUpload, Notification, PurgedUploads, QueueBounds,
-    QueueReport, QueueStats, RetryReply, Store, StoreStats, StoredInput, Swept, UploadBounds, UploadLease,
+    JobPage, JobPayload, JobQuery, Lease, NewInput, NewRecord, NewUpload, Notification, PassedOver, PurgedUploads,
+    QueueBounds, QueueReport, QueueStats, RetryReply, Store, StoreStats, StoredInput, Swept, UploadBounds, UploadLease,
     UploadStatus, WebhookOutcome, WebhookQueue,
 };
 use crate::domain::InputName;
@@ -232,7 +232,7 @@ impl<S: Store> Store for InstrumentedStore<S> {
 
     async fn claim_webhook(
         &self,
-        passed: &[String],
+        passed: &PassedOver,
         now: SystemTime,
         lease_for: Duration,
     ) -> Result<Option<Job>, Error> {

@@ -32,8 +32,8 @@ pub use input_query::{InputPage, InputQuery};
 pub use query::{JobPage, JobQuery, Order};
 pub use record::{
     Bound, CancelReply, Claim, Claimed, Claims, Created, EncodedResult, Ending, Heartbeat, JobInput, JobPayload, Lease,
-    NewRecord, Outcome, Prefetch, QueueBounds, QueueReport, QueueStats, Request, RetryReply, StoreStats, Swept,
-    TenantQueue, TenantShares, WebhookOutcome, WebhookQueue,
+    NewRecord, Outcome, PassedOver, Prefetch, QueueBounds, QueueReport, QueueStats, Request, RetryReply, StoreStats,
+    Swept, TenantQueue, TenantShares, WebhookOutcome, WebhookQueue,
 };
 pub use upload::{
     BegunUpload, NewInput, NewUpload, PurgedUploads, StoredInput, UploadBound, UploadBounds, UploadLease, UploadStatus,
@@ -167,8 +167,7 @@ pub trait Store: Send + Sync + 'static {
     async fn events_after(&self, name: &JobName, after: u64, limit: u32) -> Result<Vec<JobEvent>, Error>;
 
     /// Leases the next job in the queue and begins it; nothing where none waits, or the queue is paused. Tenants
-    /// take turns, by their weights;
-    /// within a tenant jobs go by priority, then age. Jobs past their deadline are left to [`Store::sweep`].
+    /// take turns, by their weights; within a tenant jobs go by priority, then age. Jobs past their deadline are left to [`Store::sweep`].
     ///
     /// The claim may also prefetch: it leases the job after it, which stays queued until a later claim begins it. Other
     /// claims pass over a prefetched job until that lease expires, but for those that find no other job. Nothing need
@@ -354,12 +353,12 @@ pub trait Store: Send + Sync + 'static {
     /// What is to be sent to the webhooks of jobs that have ended.
     async fn webhook_queue(&self, now: SystemTime) -> Result<WebhookQueue, Error>;
 
-    /// Leases the delivery of a job's end that is due the longest, to another receiver than those that are `passed`
-    /// over, and counts an attempt at it. Returns the job as it stands then; `None` where nothing is due. A delivery
-    /// whose lease runs out is due again.
+    /// Leases the delivery of a job's end that is due the longest, passing over some hosts and tenants, and counts an
+    /// attempt at it. Returns the job as it stands then; `None` where nothing is due. A delivery whose lease runs out
+    /// is due again.
     async fn claim_webhook(
         &self,
-        passed: &[String],
+        passed: &PassedOver,
         now: SystemTime,
         lease_for: Duration,
     ) -> Result<Option<Job>, Error>;

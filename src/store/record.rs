@@ -421,6 +421,13 @@ pub struct WebhookQueue {
     pub is_due: bool,
 }
 
+/// Whose webhooks are passed over: as many attempts at them are under way as may be.
+#[derive(Debug, Clone, Default, PartialEq, Eq)]
+pub struct PassedOver {
+    pub hosts: Vec<String>,
+    pub tenants: Vec<String>,
+}
+
 /// What an attempt at a webhook came to.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub enum WebhookOutcome {

@@ -68,7 +68,7 @@ async fn a_prefetched_job_waits_as_any_other_and_is_solved_next() {
 
 #[tokio::test]
 async fn behind_a_job_that_turns_out_long_nothing_is_prefetched_any_more() {
-    let test = TestEngine::start(Options { short_job: Duration::from_secs(2), ..workers(1) }).await;
+    let test = TestEngine::start(Options { short_job: Duration::from_secs(10), ..workers(1) }).await;
     let both = vec![new_job(Behavior::Wait), new_job(Behavior::Succeed)];
     let created = test.engine.submit_batch(both).await.expect("admitted");
     let next = &created[1].name;

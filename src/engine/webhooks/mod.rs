@@ -7,9 +7,9 @@ mod address;
 mod send;
 mod signature;
 
-use std::collections::HashMap;
+use std::collections::{BTreeMap, HashMap};
 use std::sync::Arc;
-use std::time::{Duration, SystemTime};
+use std::time::Duration;
 
 use tokio::task::{Id, JoinHandle, JoinSet};
 use tokio::time::sleep;
@@ -19,11 +19,11 @@ pub use signature::Secrets;
 use super::{Inner, Phase, observe};
 use crate::domain::job::Job;
 use crate::domain::{InvalidInput, Violation, Webhook};
-use crate::store::{self, WebhookOutcome};
+use crate::store::{self, PassedOver, WebhookOutcome};
 use observe::WebhookAttempt;
 use send::{Failed, Sender};
 
-/// How an ended job is encoded for its receiver: what it means is theirs to know.
+/// How an ended job is encoded for its receiver. The engine does not know the format.
 pub type JobEncoder = fn(&Job) -> Result<Vec<u8>, String>;
 
 /// How webhooks are delivered.
@@ -51,8 +51,11 @@ const LEASE: Duration = send::ATTEMPT_TIMEOUT.saturating_mul(2);
 /// Attempts under way at once in one server: at 10 s for an attempt that fails, three a second.
 const MOST_ATTEMPTS: usize = 32;
 
-/// The same to one receiver, so that one that is slow leaves most of them to others.
-const MOST_ATTEMPTS_OF_RECEIVER: usize = 4;
+/// The same at one host, so that one that is slow leaves most of them to others.
+const MOST_ATTEMPTS_OF_HOST: usize = 4;
+
+/// The same for one tenant, who may name any number of hosts.
+const MOST_ATTEMPTS_OF_TENANT: usize = MOST_ATTEMPTS / 2;
 
 /// Pause after the first attempt; each further one is twice as long.
 const FIRST_PAUSE: Duration = Duration::from_secs(1);
@@ -89,7 +92,11 @@ async fn run(inner: Arc<Inner>, sender: Arc<Sender>) {
     let mut attempts = Attempts::default();
     while *phase.borrow_and_update() != Phase::Closed {
         if let Err(error) = attempts.begin_due(&inner, &sender).await {
-            tracing::warn!(%error, "cannot look for webhooks");
+            // Of a full disk the sweeper tells; it is looked at again every second.
+            match inner.store.has_room() {
+                true => tracing::warn!(%error, "cannot look for webhooks"),
+                false => tracing::debug!(%error, "cannot look for webhooks"),
+            }
         }
         tokio::select! {
             _ = phase.changed() => {}
@@ -107,39 +114,41 @@ async fn run(inner: Arc<Inner>, sender: Arc<Sender>) {
 #[derive(Default)]
 struct Attempts {
     tasks: JoinSet<()>,
-    /// The receiver of each.
-    receivers: HashMap<Id, String>,
+    /// Host and tenant of each.
+    under_way: HashMap<Id, [String; 2]>,
 }
 
 impl Attempts {
     /// Begins attempts at what is due, as many as may be under way.
     async fn begin_due(&mut self, inner: &Arc<Inner>, sender: &Arc<Sender>) -> Result<(), store::Error> {
-        let queue = inner.store.webhook_queue(SystemTime::now()).await?;
+        let queue = inner.store.webhook_queue(inner.now()).await?;
         observe::webhooks_pending(queue.pending);
         while queue.is_due && self.tasks.len() < MOST_ATTEMPTS {
-            let claimed = inner.store.claim_webhook(&self.busy_receivers(), SystemTime::now(), LEASE).await?;
+            let claimed = inner.store.claim_webhook(&self.passed_over(), inner.now(), LEASE).await?;
             let Some((webhook, job)) = claimed.and_then(|job| Some((job.webhook.clone()?, job))) else { break };
-            let receiver = webhook.receiver();
+            let of = [webhook.host(), job.name.tenant.clone()];
             let task = self.tasks.spawn(attempt(inner.clone(), sender.clone(), inner.dated(job), webhook));
-            self.receivers.insert(task.id(), receiver);
+            self.under_way.insert(task.id(), of);
         }
         Ok(())
     }
 
-    /// Receivers that have as many attempts as they may.
-    fn busy_receivers(&self) -> Vec<String> {
-        let mut counts: HashMap<&String, usize> = HashMap::new();
-        self.receivers.values().for_each(|receiver| *counts.entry(receiver).or_default() += 1);
-        let busy = counts.into_iter().filter(|(_, count)| *count >= MOST_ATTEMPTS_OF_RECEIVER);
-        busy.map(|(receiver, _)| receiver.clone()).collect()
+    /// Hosts and tenants that have as many attempts as they may.
+    fn passed_over(&self) -> PassedOver {
+        let busy = |place: usize, bound: usize| {
+            let mut counts: BTreeMap<&String, usize> = BTreeMap::new();
+            self.under_way.values().for_each(|of| *counts.entry(&of[place]).or_default() += 1);
+            counts.into_iter().filter(|(_, count)| *count >= bound).map(|(name, _)| name.clone()).collect()
+        };
+        PassedOver { hosts: busy(0, MOST_ATTEMPTS_OF_HOST), tenants: busy(1, MOST_ATTEMPTS_OF_TENANT) }
     }
 
     /// Waits until an attempt has ended; for ever where none is under way.
     async fn one_ended(&mut self) {
         match self.tasks.join_next_with_id().await {
-            Some(Ok((id, ()))) => drop(self.receivers.remove(&id)),
+            Some(Ok((id, ()))) => drop(self.under_way.remove(&id)),
             // By a panic, which has been reported; its lease runs out.
-            Some(Err(error)) => drop(self.receivers.remove(&error.id())),
+            Some(Err(error)) => drop(self.under_way.remove(&error.id())),
             None => std::future::pending().await,
         }
     }
@@ -148,9 +157,9 @@ impl Attempts {
 /// Makes an attempt and has the store note what it came to.
 async fn attempt(inner: Arc<Inner>, sender: Arc<Sender>, job: Job, webhook: Webhook) {
     let sent = sender.send(&job, &webhook).await;
-    let since_end = job.end_time.and_then(|end| SystemTime::now().duration_since(end).ok()).unwrap_or_default();
+    let since_end = job.end_time.and_then(|end| inner.now().duration_since(end).ok()).unwrap_or_default();
     let outcome = outcome(sent, webhook.attempts, since_end, sender.options().retry_for);
-    let noted = inner.store.settle_webhook(&job, &outcome, SystemTime::now()).await;
+    let noted = inner.store.settle_webhook(&job, &outcome, inner.now()).await;
     let (name, attempts, receiver) = (&job.name, webhook.attempts, webhook.receiver());
     match &outcome {
         WebhookOutcome::Delivered => {
@@ -243,20 +252,25 @@ mod tests {
     }
 
     #[tokio::test]
-    async fn a_receiver_with_as_many_attempts_as_it_may_have_is_busy_until_one_ends() {
+    async fn a_host_or_tenant_with_as_many_attempts_as_it_may_have_is_passed_over_until_one_ends() {
         let mut attempts = Attempts::default();
-        for number in 0..MOST_ATTEMPTS_OF_RECEIVER {
-            assert!(attempts.busy_receivers().is_empty());
+        for number in 0..MOST_ATTEMPTS_OF_HOST {
+            assert_eq!(attempts.passed_over(), PassedOver::default());
             let task = match number {
                 0 => attempts.tasks.spawn(std::future::ready(())),
                 _ => attempts.tasks.spawn(std::future::pending()),
             };
-            attempts.receivers.insert(task.id(), "https://slow.example".into());
+            attempts.under_way.insert(task.id(), ["slow.example".into(), format!("tenant-{number}")]);
         }
-        let other = attempts.tasks.spawn(std::future::pending());
-        attempts.receivers.insert(other.id(), "https://quick.example".into());
-        assert_eq!(attempts.busy_receivers(), ["https://slow.example"]);
+        let slow = PassedOver { hosts: vec!["slow.example".into()], tenants: Vec::new() };
+        assert_eq!(attempts.passed_over(), slow);
         attempts.one_ended().await;
-        assert!(attempts.busy_receivers().is_empty());
+        assert_eq!(attempts.passed_over(), PassedOver::default());
+        for number in 0..MOST_ATTEMPTS_OF_TENANT {
+            assert_eq!(attempts.passed_over(), PassedOver::default());
+            let task = attempts.tasks.spawn(std::future::pending());
+            attempts.under_way.insert(task.id(), [format!("{number}.example"), "acme".into()]);
+        }
+        assert_eq!(attempts.passed_over(), PassedOver { hosts: Vec::new(), tenants: vec!["acme".into()] });
     }
 }

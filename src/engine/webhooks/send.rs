@@ -31,8 +31,7 @@ pub(super) const ATTEMPT_TIMEOUT: Duration = Duration::from_secs(10);
 /// How long one address of a receiver may take to connect, so that there is time for the next one.
 const CONNECT_TIMEOUT: Duration = Duration::from_secs(4);
 
-/// Bytes that the head of an answer may have. The body is not read: only the status matters, and what an answer holds
-/// is nobody's here.
+/// Bytes that the head of an answer may have. The body is not read: only the status matters.
 const MAX_HEAD_BYTES: usize = 16 << 10;
 
 /// Who sends.
@@ -99,7 +98,8 @@ impl Sender {
         }
     }
 
-    /// The request with its signature. Its id is that of the job's end, the same in every attempt.
+    /// The request with its signature. Its id is that of the event that ended the job: the same in every
+    /// attempt, and another one where a job that was retried ends again.
     fn request(&self, job: &Job, url: &Url, now: SystemTime) -> Result<Request<Full<Bytes>>, String> {
         let secrets = self.options.secrets.of(&job.name.tenant);
         if secrets.is_empty() {
@@ -107,7 +107,7 @@ impl Sender {
         }
         let seconds = |time: SystemTime| time.duration_since(SystemTime::UNIX_EPOCH).unwrap_or_default();
         let body = (self.options.encode)(job)?;
-        let id = format!("{}-{:x}", job.name, seconds(job.create_time).as_micros());
+        let id = format!("{}-{:x}-{}", job.name, seconds(job.create_time).as_micros(), job.last_sequence);
         let timestamp = seconds(now).as_secs();
         let host = match (url.host_str().unwrap_or_default(), url.port()) {
             (host, Some(port)) => format!("{host}:{port}"),

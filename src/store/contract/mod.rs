@@ -44,6 +44,7 @@ macro_rules! store_contract {
             leases::deadlines_end_what_waits,
             tenants::tenants_take_turns_and_priority_counts_within_one,
             tenants::weights_are_shares,
+            tenants::weights_are_shares_where_jobs_are_prefetched,
             tenants::an_idle_tenant_saves_nothing_up,
             tenants::the_running_jobs_of_a_tenant_are_bounded,
             tenants::a_bound_holds_however_many_claim_at_once,
@@ -79,7 +80,8 @@ macro_rules! store_contract {
             webhooks::every_end_of_a_job_makes_its_webhook_due,
             webhooks::an_attempt_is_leased_and_settled_once,
             webhooks::a_failed_attempt_is_due_again_later_and_a_last_one_never,
-            webhooks::busy_receivers_are_passed_over,
+            webhooks::a_retried_job_has_another_end_to_send,
+            webhooks::busy_hosts_and_tenants_are_passed_over,
             webhooks::no_delivery_is_claimed_twice,
             webhooks::a_deleted_job_takes_its_webhook_along,
         );

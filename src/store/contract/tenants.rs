@@ -53,6 +53,25 @@ pub(in crate::store) async fn weights_are_shares(store: &dyn Store) {
     assert_eq!(turns(store, &shares, 6).await, "aaaaaa", "who is alone has all");
 }
 
+pub(in crate::store) async fn weights_are_shares_where_jobs_are_prefetched(store: &dyn Store) {
+    let shares = TenantShares { weights: BTreeMap::from([("b".into(), 3)]), ..TenantShares::default() };
+    let prefetch = Some(Prefetch { lease_for: LEASE, max_observations: u32::MAX });
+    create_of(store, "a", 0..20, 0).await;
+    create_of(store, "b", 0..60, 0).await;
+    // Six workers, each of which has a job before it and one after it.
+    let mut prefetched = std::collections::VecDeque::new();
+    let mut begun = String::new();
+    for turn in 0..40 {
+        let next: Option<Claimed> = if turn < 6 { None } else { prefetched.pop_front() };
+        let begin = next.map(|next| (next.lease, next.job.create_time));
+        let claim = Claim { begin, prefetch, shares: Arc::new(shares.clone()), ..Claim::one("worker", LEASE) };
+        let claims = store.claim(&claim, time(100)).await.expect("claims");
+        begun.push_str(&claims.begun.expect("a job").job.name.job[..1]);
+        prefetched.push_back(claims.prefetched.expect("another"));
+    }
+    assert_eq!((begun.matches('a').count(), begun.matches('b').count()), (10, 30), "{begun}");
+}
+
 pub(in crate::store) async fn an_idle_tenant_saves_nothing_up(store: &dyn Store) {
     let equal = TenantShares::default();
     create_of(store, "a", 0..12, 0).await;

@@ -2,7 +2,7 @@
 
 use super::*;
 use crate::domain::{Webhook, WebhookState};
-use crate::store::{WebhookOutcome, WebhookQueue};
+use crate::store::{PassedOver, WebhookOutcome, WebhookQueue};
 
 const URL: &str = "https://hooks.example/a?b=c";
 
@@ -20,7 +20,7 @@ async fn ended(store: &dyn Store, job: &str, url: &str, seconds: u64) -> JobName
 }
 
 async fn claim_webhook(store: &dyn Store, seconds: u64) -> Option<Job> {
-    store.claim_webhook(&[], time(seconds), LEASE).await.expect("claims")
+    store.claim_webhook(&PassedOver::default(), time(seconds), LEASE).await.expect("claims")
 }
 
 async fn settle(store: &dyn Store, job: &Job, outcome: WebhookOutcome, seconds: u64) -> bool {
@@ -77,12 +77,11 @@ pub(in crate::store) async fn every_end_of_a_job_makes_its_webhook_due(store: &d
         ("failed", JobState::Failed),
         ("lost", JobState::Failed),
     ];
-    assert_eq!(sent, expected.map(|(job, state)| (job.to_owned(), state)), "what is due the longest is first");
+    assert_eq!(sent, expected.map(|(job, state)| (job.to_owned(), state)), "in the order of the jobs");
 }
 
 pub(in crate::store) async fn an_attempt_is_leased_and_settled_once(store: &dyn Store) {
     let name = ended(store, "a", URL, 1).await;
-    assert_eq!(claim_webhook(store, 0).await, None, "not due yet");
     let first = claim_webhook(store, 1).await.expect("due");
     assert_eq!(first.webhook, Some(Webhook { attempts: 1, ..Webhook::pending(URL) }));
     assert_eq!(store.job(&name).await, Ok(first.clone()));
@@ -118,14 +117,36 @@ pub(in crate::store) async fn a_failed_attempt_is_due_again_later_and_a_last_one
     assert_eq!(claim_webhook(store, 1_000_000).await, None);
 }
 
-pub(in crate::store) async fn busy_receivers_are_passed_over(store: &dyn Store) {
+pub(in crate::store) async fn a_retried_job_has_another_end_to_send(store: &dyn Store) {
+    let name = create(store, hooked("a", URL), 0).await.name;
+    let fail = || Arc::new(Ending { outcome: Outcome::Failed(Failure::new("INTERNAL", "a defect")), progress: None });
+    let lease = claim(store, 0).await.lease;
+    store.finish(&lease, &fail(), time(1)).await.expect("finishes");
+    let first = claim_webhook(store, 2).await.expect("due");
+    let reply = store.retry_job(&name, None, &ROOM, time(3)).await.expect("retries");
+    assert_eq!(reply.job.webhook, Some(Webhook::pending(URL)));
+    assert_eq!(queue(store, 1_000).await, WebhookQueue { pending: 0, is_due: false }, "it has not ended again");
+    let lease = claim(store, 3).await.lease;
+    store.finish(&lease, &fail(), time(4)).await.expect("finishes");
+    let second = claim_webhook(store, 5).await.expect("due");
+    // Both are the first attempts at their ends.
+    assert_eq!(second.webhook, first.webhook);
+    assert!(second.last_sequence > first.last_sequence);
+    assert!(!settle(store, &first, WebhookOutcome::Delivered, 6).await, "the end of before");
+    assert_eq!(webhook(store, &name).await.state, WebhookState::Pending);
+    assert!(settle(store, &second, WebhookOutcome::Delivered, 6).await);
+}
+
+pub(in crate::store) async fn busy_hosts_and_tenants_are_passed_over(store: &dyn Store) {
     for (job, url, seconds) in
         [("a", "https://slow.example/a", 1), ("b", "https://slow.example/b", 2), ("c", "http://quick.example:81/", 3)]
     {
         ended(store, job, url, seconds).await;
     }
-    let busy = ["https://slow.example".to_owned(), "http://other.example".to_owned()];
-    let claimed = store.claim_webhook(&busy, time(4), LEASE).await.expect("claims").expect("another receiver's");
+    let busy = PassedOver { hosts: vec!["slow.example".into(), "other.example".into()], tenants: Vec::new() };
+    let busy_tenant = PassedOver { hosts: Vec::new(), tenants: vec!["other".into(), "t".into()] };
+    assert_eq!(store.claim_webhook(&busy_tenant, time(4), LEASE).await, Ok(None));
+    let claimed = store.claim_webhook(&busy, time(4), LEASE).await.expect("claims").expect("another host's");
     assert_eq!(claimed.name.job, "c");
     assert_eq!(store.claim_webhook(&busy, time(4), LEASE).await, Ok(None));
     assert_eq!(claim_webhook(store, 4).await.map(|job| job.name.job), Some("a".into()));

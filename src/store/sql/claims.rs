@@ -48,7 +48,8 @@ pub(super) async fn claim<C: Connection>(
     Ok(Claims { begun: Some(begun), prefetched })
 }
 
-/// The job whose turn it is among those that nobody has a lease on; none where it has more observations than that.
+/// The job whose turn it is among those that nobody has a lease on, counted for its tenant; none where it has more
+/// observations than that.
 async fn next<C: Connection>(
     connection: &mut C,
     claim: &Claim,
@@ -67,7 +68,11 @@ async fn next<C: Connection>(
         .then(C::SKIP_LOCKED);
         if let Some(row) = connection.optional_row(first).await? {
             let job = LockedJob::from_row(&row)?;
-            return Ok(Some(job).filter(|job| job.observation_count <= max_observations));
+            if job.observation_count > max_observations {
+                break;
+            }
+            connection.execute(fairness::count::<C>(&claim.shares, &tenant)).await?;
+            return Ok(Some(job));
         }
     }
     Ok(None)
@@ -144,8 +149,7 @@ async fn begin<C: Connection>(
         .bind(micros(now));
     let event = EventBody::State { state: JobState::Running, failure: None };
     let event = insert_event(job.id, sequence, attempt, &event, now)?;
-    let count = fairness::count::<C>(&claim.shares, &job.name.tenant);
-    let rows = connection.batch(vec![lease, begin, event, count]).await?;
+    let rows = connection.batch(vec![lease, begin, event]).await?;
     connection.notify(Change::Events, &job.name).await?;
     let changed = rows.first().ok_or_else(|| Error::Corrupt("a job that was just leased is not there".into()))?;
     claimed(changed, 0)

@@ -1,10 +1,11 @@
 //! Whose turn it is: tenants share the workers by start-time fair queueing (Goyal, Vin, Cheng: Start-time Fair
 //! Queueing, 1996).
 //!
-//! Each tenant has a virtual time, at which its latest job began. Its next one begins a step later, and the tenant
-//! whose next one begins first has its turn. A step is shorter the larger the tenant's weight. The virtual time of all
-//! is that at which the latest job of any began: a tenant that had nothing to do goes on from there, so that it saves
-//! nothing up. All of it is in the tables: it holds over all servers of a store, and after a restart.
+//! Each tenant has a virtual time, at which its latest job had its turn: was begun, or prefetched. Its next one has its
+//! turn a step later, and the tenant whose next one is first is served. A step is shorter the larger the tenant's
+//! weight. The virtual time of all is that of the latest turn of any: a tenant that had nothing to do goes on from
+//! there, so that it saves nothing up. All of it is in the tables: it holds over all servers of a store, and after a
+//! restart.
 //!
 //! Servers that begin jobs of one tenant at the same moment do not wait for each other. A job then may go uncounted,
 //! and the tenant be served once more than its share.
@@ -79,7 +80,7 @@ async fn full<C: Connection>(
     rows.iter().map(|row| row.text("tenant")).collect()
 }
 
-/// Counts a job that a tenant begins, unless another transaction is counting one of it.
+/// Counts a turn of a tenant, unless another transaction is counting one of it.
 pub(super) fn count<C: Connection>(shares: &TenantShares, tenant: &str) -> Statement {
     Statement::new(
         "UPDATE tenants SET virtual_start = CASE \

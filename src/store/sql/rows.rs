@@ -293,7 +293,7 @@ pub(super) async fn transition<C: Connection>(
     batch.push(update);
     let changed = one_job(&connection.batch(batch).await?)?;
     if changed.webhook.is_some() && next.is_terminal() {
-        connection.execute(webhooks::due(job.id, now)).await?;
+        connection.execute(webhooks::due(job.id)).await?;
     }
     connection.notify(Change::Events, &job.name).await?;
     if next == JobState::Queued {

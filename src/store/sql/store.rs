@@ -12,7 +12,8 @@ use crate::domain::job::{Job, JobEvent, JobName};
 use crate::domain::progress::Progress;
 use crate::store::record::{
     CancelReply, Claim, Claims, Created, EncodedResult, Ending, Heartbeat, JobInput, JobPayload, Lease, NewRecord,
-    Outcome, QueueBounds, QueueReport, QueueStats, RetryReply, StoreStats, Swept, WebhookOutcome, WebhookQueue,
+    Outcome, PassedOver, QueueBounds, QueueReport, QueueStats, RetryReply, StoreStats, Swept, WebhookOutcome,
+    WebhookQueue,
 };
 use crate::store::upload::{
     BegunUpload, NewInput, NewUpload, PurgedUploads, StoredInput, UploadBounds, UploadLease, UploadStatus,
@@ -314,12 +315,11 @@ impl<D: Database> Store for D {
 
     async fn claim_webhook(
         &self,
-        passed: &[String],
+        passed: &PassedOver,
         now: SystemTime,
         lease_for: Duration,
     ) -> Result<Option<Job>, Error> {
         let due_by = self.lease_clock(now);
-        let passed: Arc<[String]> = passed.into();
         writes!(self, Size::Small, WriteIntent::Begins(0), [passed], |connection| webhooks::claim(
             connection,
             &passed,

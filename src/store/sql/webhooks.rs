@@ -2,22 +2,22 @@
 
 use std::time::SystemTime;
 
-use super::rows::{self, micros, number, select_jobs};
+use super::rows::{self, integer, micros, number, select_jobs};
 use super::{Connection, Row, Statement};
 use crate::domain::job::Job;
 use crate::domain::{Webhook, WebhookState};
-use crate::store::record::{WebhookOutcome, WebhookQueue};
+use crate::store::record::{PassedOver, WebhookOutcome, WebhookQueue};
 use crate::store::{Error, payload};
 
 /// Stores the webhook of a job of this row. It is not due before the job ends.
 pub(super) fn insert(id: i64, webhook: &Webhook) -> Result<Statement, Error> {
-    let insert = Statement::new("INSERT INTO webhooks (job_id, receiver, webhook) VALUES ($1, $2, $3)").bind(id);
-    Ok(insert.bind(&webhook.receiver()).bind(payload::encode(webhook)?))
+    let insert = Statement::new("INSERT INTO webhooks (job_id, host, webhook) VALUES ($1, $2, $3)").bind(id);
+    Ok(insert.bind(&webhook.host()).bind(payload::encode(webhook)?))
 }
 
-/// Makes the webhook of a job due that ends now.
-pub(super) fn due(id: i64, now: SystemTime) -> Statement {
-    Statement::new("UPDATE webhooks SET due_time = $1 WHERE job_id = $2").bind(micros(now)).bind(id)
+/// Makes the webhook of a job due that ends now: at once, on whatever clock.
+pub(super) fn due(id: i64) -> Statement {
+    Statement::new("UPDATE webhooks SET due_time = 0 WHERE job_id = $1").bind(id)
 }
 
 /// Has the end of a job sent that is still to come, as if none had been.
@@ -39,13 +39,16 @@ pub(super) async fn queue<C: Connection>(connection: &mut C, due_by: SystemTime)
 /// Leases what is due until `expires`; see [`crate::store::Store::claim_webhook`].
 pub(super) async fn claim<C: Connection>(
     connection: &mut C,
-    passed: &[String],
+    passed: &PassedOver,
     due_by: SystemTime,
     expires: SystemTime,
 ) -> Result<Option<Job>, Error> {
     let mut next = Statement::new("SELECT job_id, webhook FROM webhooks WHERE due_time <= $1").bind(micros(due_by));
-    for receiver in passed {
-        next = next.then(" AND receiver <> ").then_bind(receiver);
+    for host in &passed.hosts {
+        next = next.then(" AND host <> ").then_bind(host);
+    }
+    for tenant in &passed.tenants {
+        next = next.then(" AND (SELECT tenant FROM jobs WHERE jobs.id = webhooks.job_id) <> ").then_bind(tenant);
     }
     let next = next.then(" ORDER BY due_time, job_id LIMIT 1").then(C::SKIP_LOCKED);
     let Some(row) = connection.optional_row(next).await? else { return Ok(None) };
@@ -65,11 +68,14 @@ pub(super) async fn settle<C: Connection>(
 ) -> Result<bool, Error> {
     let select = Statement::new(
         "SELECT job_id, webhook FROM webhooks \
-         WHERE job_id = (SELECT id FROM jobs WHERE tenant = $1 AND job = $2 AND create_time = $3)",
+         WHERE job_id = (SELECT id FROM jobs \
+                         WHERE tenant = $1 AND job = $2 AND create_time = $3 AND last_sequence = $4)",
     )
     .bind(&claimed.name.tenant)
     .bind(&claimed.name.job)
     .bind(micros(claimed.create_time))
+    // A job that was retried has another end since.
+    .bind(integer(claimed.last_sequence))
     .then(C::FOR_UPDATE);
     let Some(row) = connection.optional_row(select).await? else { return Ok(false) };
     let (id, webhook) = read(&row)?;

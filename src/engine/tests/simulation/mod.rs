@@ -1,8 +1,8 @@
 //! Engines and their stores under simulated time, networks and disks, with faults by seed: a failing seed replays.
 //!
 //! Each server is a tokio runtime of one thread with a paused clock, and all of them go forward together, step by step.
-//! What runs is the engine, and the SQL that ships, on a SQLite in memory (`store::simulated`). Not simulated are worker
-//! threads, which are tasks here, and PostgreSQL's locks: see `tests/it/replicas.rs` for a real one.
+//! What runs is the engine, and the SQL that ships, on a SQLite in memory (`store::simulated`). Not simulated are
+//! worker threads, which are tasks here, and PostgreSQL's locks: see `tests/it/replicas.rs` for a real one.
 
 mod check;
 mod client;

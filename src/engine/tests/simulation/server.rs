@@ -146,7 +146,7 @@ impl Server {
     }
 }
 
-/// A worker: what its thread is in earnest.
+/// A worker, which is a thread outside of simulations.
 async fn work(mut inbox: mpsc::Receiver<Assigned>, dead: Arc<AtomicBool>) {
     while let Some(assignment) = inbox.recv().await {
         let seed = assignment.settings().seed;

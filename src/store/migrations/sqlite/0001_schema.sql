@@ -161,8 +161,8 @@ CREATE TABLE attempts (
 -- The outbox of webhooks: a job's end that is to be sent, or was.
 CREATE TABLE webhooks (
     job_id   INTEGER PRIMARY KEY REFERENCES jobs (id) ON DELETE CASCADE,
-    -- Scheme, host and port of the URL: attempts at one receiver are bounded.
-    receiver TEXT    NOT NULL,
+    -- Of the URL: attempts at one host are bounded.
+    host     TEXT    NOT NULL,
     -- URL, state, attempts and last error.
     webhook  BLOB    NOT NULL,
     -- When the next attempt is due, or the lease of the present one ends. None before the job has ended, and after the
