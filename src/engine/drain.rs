@@ -110,8 +110,8 @@ impl Inner {
         if !matches!(self.interrupted.run_until_cancelled(in_time).await, Some(Ok(()))) {
             // Before the look: whoever is listed after it finds this.
             self.interrupted.cancel();
-            for stop in locked(&self.running).values() {
-                stop.stop(StopReason::Interrupted);
+            for listed in locked(&self.running).values() {
+                listed.stop.stop(StopReason::Interrupted);
             }
             if timeout(GIVE_BACK_GRACE, all_ended(&mut slots)).await.is_err() {
                 // Their leases run out, or are taken back at the next start.

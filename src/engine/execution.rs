@@ -6,7 +6,6 @@
 //! the store and a dozen wake-ups beside busy solvers, some 3 ms. The store is told meanwhile. Where it says that
 //! another worker was first, or that the job was cancelled, the work is stopped, and nothing was written of it.
 
-use std::collections::hash_map::Entry;
 use std::pin::pin;
 use std::sync::Arc;
 use std::time::{Duration, SystemTime};
@@ -14,9 +13,10 @@ use std::time::{Duration, SystemTime};
 use tokio::time::{Instant, Interval, MissedTickBehavior, interval_at, sleep, sleep_until, timeout_at};
 use tracing::{Instrument, Span};
 
+use super::Inner;
 use super::observe::{self, Attempt, AttemptLost};
+use super::running::Running;
 use super::worker::{Assignment, AttemptHandle, Report, Started, Verdict, Worker};
-use super::{Inner, locked};
 use crate::domain::job::{Failure, Job, JobName, JobState};
 use crate::domain::{Grade, Progress, StopReason, StopToken};
 use crate::store::{self, Claimed, Ending, Lease, Outcome, Store};
@@ -75,7 +75,7 @@ pub(super) struct JobExecution {
     lost: bool,
     /// The last progress that was stored.
     stored: Option<Progress>,
-    _running: Running,
+    running: Running,
 }
 
 /// An attempt in a worker's hands.
@@ -89,42 +89,6 @@ pub(super) struct Finished {
     execution: JobExecution,
     verdict: Verdict,
     latest: Option<Progress>,
-}
-
-/// Lists an attempt among the running ones as long as it lives, and stops what is left of it then.
-struct Running {
-    inner: Arc<Inner>,
-    lease: Lease,
-    stop: StopToken,
-}
-
-impl Running {
-    fn list(inner: Arc<Inner>, lease: &Lease, stop: &StopToken, is_begun: bool) -> Self {
-        match locked(&inner.running).entry(lease.clone()) {
-            Entry::Vacant(place) => {
-                place.insert(stop.clone());
-            }
-            // Another slot has prefetched it, and is not the first to begin.
-            Entry::Occupied(mut other) if is_begun => other.insert(stop.clone()).stop(StopReason::Interrupted),
-            Entry::Occupied(_) => stop.stop(StopReason::Interrupted),
-        }
-        // Claimed while a drain told those that were listed to stop.
-        if inner.interrupted.is_cancelled() {
-            stop.stop(StopReason::Interrupted);
-        }
-        Self { inner, lease: lease.clone(), stop: stop.clone() }
-    }
-}
-
-impl Drop for Running {
-    fn drop(&mut self) {
-        self.stop.stop(StopReason::Interrupted);
-        let mut running = locked(&self.inner.running);
-        // A slot that begins what this one had only prefetched has its own there.
-        if running.get(&self.lease).is_some_and(|listed| listed.is(&self.stop)) {
-            running.remove(&self.lease);
-        }
-    }
 }
 
 /// How a job is told to stop, which it does by itself at its deadline.
@@ -152,7 +116,7 @@ impl JobExecution {
             leased_until: Instant::now() + lease_for,
             lost: false,
             stored: None,
-            _running: running,
+            running,
         };
         if execution.is_begun() {
             let Lease { name, attempt } = &execution.lease;
@@ -184,7 +148,7 @@ impl JobExecution {
         let loading = async {
             let input = match self.read_input().await {
                 Ok(input) => input,
-                Err(verdict) => return Err(Finished { execution: self, verdict, latest: None }),
+                Err(verdict) => return Err(Finished::new(self, verdict, None)),
             };
             let subscription = self.inner.notifier.subscribe(&self.job.name);
             // Weights of an earlier attempt are out of date.
@@ -278,7 +242,7 @@ impl JobExecution {
             }
             None => Verdict::Stopped(StopReason::Interrupted),
         };
-        Finished { execution: self, verdict, latest }
+        Finished::new(self, verdict, latest)
     }
 
     async fn store_progress(&mut self, progress: Option<Progress>) {
@@ -437,6 +401,11 @@ impl Loaded {
 }
 
 impl Finished {
+    fn new(execution: JobExecution, verdict: Verdict, latest: Option<Progress>) -> Self {
+        execution.running.set_solved();
+        Self { execution, verdict, latest }
+    }
+
     /// Commits what the attempt came to.
     pub(super) async fn finalise(self) {
         let Self { mut execution, verdict, latest } = self;

@@ -9,6 +9,7 @@ mod execution;
 mod notifications;
 mod notifier;
 mod observe;
+mod running;
 mod slot;
 mod submit;
 mod upload;
@@ -19,7 +20,6 @@ mod worker;
 #[cfg(test)]
 mod tests;
 
-use std::collections::HashMap;
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::time::{Duration, SystemTime};
 
@@ -42,7 +42,7 @@ use crate::domain::job::{Job, JobName, JobState};
 use crate::domain::{Backend, Input, Observer, Solution, SolveSettings, StopToken};
 use crate::parallel::Threads;
 use crate::solver;
-use crate::store::{self, Lease, Store};
+use crate::store::{self, Store};
 
 /// What workers run; [`default_solver`] in earnest, a stand-in in tests.
 pub type Solver =
@@ -190,7 +190,7 @@ struct Inner {
     store: Arc<dyn Store>,
     notifier: Arc<notifier::Notifier>,
     /// Attempts that run in this process or are prefetched, for a cancel to reach them at once.
-    running: Mutex<HashMap<Lease, StopToken>>,
+    running: Mutex<running::Attempts>,
     /// Counts the reasons to look for a job to claim; slots wait for a change.
     work: channel::Sender<u64>,
     /// Wakes the task that counts the queue.

@@ -52,8 +52,8 @@ impl Inner {
     /// Stops whatever runs here for a job. There may be two attempts for a while: one that lost its lease and does not
     /// know yet.
     pub(super) fn stop_attempts(&self, name: &JobName) {
-        for (_, stop) in locked(&self.running).iter().filter(|(lease, _)| lease.name == *name) {
-            stop.stop(StopReason::Cancelled);
+        for (_, listed) in locked(&self.running).iter().filter(|(lease, _)| lease.name == *name) {
+            listed.stop.stop(StopReason::Cancelled);
         }
     }
 }

@@ -199,6 +199,7 @@ impl Inner {
             begin,
             prefetch: (!short_job.is_zero()).then_some(terms),
             shares: shares.clone(),
+            solved: if shares.max_running.is_some() { self.solved() } else { Vec::new() },
         };
         let claims = self.store.claim(&claim, now).await.unwrap_or_else(|error| {
             self.not_claimed(&error);

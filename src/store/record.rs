@@ -269,12 +269,22 @@ pub struct Claim {
     /// Where one is begun, the one after it is leased too; `None`: no other one.
     pub prefetch: Option<Prefetch>,
     pub shares: Arc<TenantShares>,
+    /// Leases of jobs that are solved and whose end is not stored yet: they do not count for the bound on running jobs,
+    /// for whose place this claim is made.
+    pub solved: Vec<Lease>,
 }
 
 impl Claim {
     /// Of the next job alone, where all tenants have equal shares.
     pub fn one(worker: &str, lease_for: Duration) -> Self {
-        Self { worker: worker.into(), lease_for, begin: None, prefetch: None, shares: Arc::default() }
+        Self {
+            worker: worker.into(),
+            lease_for,
+            begin: None,
+            prefetch: None,
+            shares: Arc::default(),
+            solved: Vec::new(),
+        }
     }
 }
 

@@ -257,7 +257,7 @@ async fn operators_see_every_call_who_changed_what_and_who_was_refused() {
     let server = Serving::start_with(&data_dir, &variables, File::create(&log).expect("a log file"));
     let channel = Channel::from_shared(server.grpc.clone()).expect("an address").connect().await.expect("a connection");
     let mut jobs = JobServiceClient::new(keyed(&channel, NORTH));
-    let mut create = tonic::Request::new(small(1));
+    let mut create = tonic::Request::new(proto::CreateJobRequest { parent: "tenants/-".into(), ..small(1) });
     let traceparent = format!("00-{TRACE_ID}-00f067aa0ba902b7-01");
     create.metadata_mut().insert("traceparent", traceparent.parse().expect("ASCII"));
     let name = jobs.create_job(create).await.expect("a job").into_inner().name;

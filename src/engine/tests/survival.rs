@@ -277,7 +277,7 @@ async fn a_cancel_reaches_the_attempt_that_holds_the_lease_though_another_still_
     test.store.sweep(SystemTime::now() + Duration::from_secs(4000), 3).await.expect("sweeps");
     test.solver.until_waiting(2).await;
     test.engine.cancel(&name).await.expect("exists");
-    let tokens: Vec<_> = locked(&test.engine.inner.running).values().map(StopToken::is_stopped).collect();
+    let tokens: Vec<_> = locked(&test.engine.inner.running).values().map(|listed| listed.stop.is_stopped()).collect();
     assert_eq!(tokens, [true, true]);
     test.solver.release();
     test.ended(&name).await;

@@ -47,6 +47,7 @@ macro_rules! store_contract {
             tenants::weights_are_shares_where_jobs_are_prefetched,
             tenants::an_idle_tenant_saves_nothing_up,
             tenants::the_running_jobs_of_a_tenant_are_bounded,
+            tenants::a_job_that_is_solved_leaves_its_place_before_its_end_is_stored,
             tenants::a_bound_holds_however_many_claim_at_once,
             reading::listings_page_and_filter,
             reading::events_come_in_order_and_in_portions,

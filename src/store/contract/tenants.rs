@@ -104,6 +104,16 @@ pub(in crate::store) async fn the_running_jobs_of_a_tenant_are_bounded(store: &d
     assert_eq!(begun(store, &TenantShares::default(), 1).await, ["a-3"], "without a bound");
 }
 
+pub(in crate::store) async fn a_job_that_is_solved_leaves_its_place_before_its_end_is_stored(store: &dyn Store) {
+    let shares = TenantShares { max_running: Some(1), ..TenantShares::default() };
+    create_of(store, "a", 0..3, 0).await;
+    let first = claim_with(store, &shares, None).await.begun.expect("a job");
+    assert_eq!(claim_with(store, &shares, None).await, Claims::default(), "one runs");
+    let claim = Claim { shares: Arc::new(shares), solved: vec![first.lease], ..Claim::one("worker", LEASE) };
+    assert_eq!(store.claim(&claim, time(100)).await.expect("claims").begun.expect("a job").job.name.job, "a-1");
+    assert_eq!(store.claim(&claim, time(100)).await, Ok(Claims::default()), "the second one runs");
+}
+
 pub(in crate::store) async fn a_bound_holds_however_many_claim_at_once(store: &dyn Store) {
     let shares = TenantShares { max_running: Some(3), ..TenantShares::default() };
     create_of(store, "a", 0..12, 0).await;

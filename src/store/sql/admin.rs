@@ -1,5 +1,7 @@
 //! What an operator does to jobs and to the queue: retries, priorities, pauses, and a look at the whole.
 
+use std::cmp::Reverse;
+use std::collections::BTreeMap;
 use std::time::SystemTime;
 
 use super::jobs::{self, AdmissionStats};
@@ -83,36 +85,36 @@ pub(super) async fn set_paused<C: Connection>(connection: &mut C, paused: bool, 
 /// The queue as its administrator sees it.
 pub(super) async fn queue<C: Connection>(connection: &mut C, tenants: u32) -> Result<QueueReport, Error> {
     let pause = connection.row(Statement::new("SELECT pause_time FROM queue")).await?;
-    // Each half is answered by an index alone.
+    // One look, so that the counts of tenants add up to those of all. Each half is answered by an index alone.
     let counts = Statement::new(
-        "SELECT state, COUNT(*) AS jobs FROM jobs WHERE state IN ('QUEUED', 'RUNNING') GROUP BY state \
-         UNION ALL SELECT state, COUNT(*) AS jobs FROM jobs WHERE end_time IS NOT NULL GROUP BY state",
+        "SELECT state, tenant, COUNT(*) AS jobs FROM jobs WHERE state IN ('QUEUED', 'RUNNING') GROUP BY state, tenant \
+         UNION ALL SELECT state, '' AS tenant, COUNT(*) AS jobs FROM jobs WHERE end_time IS NOT NULL GROUP BY state",
     );
     let mut jobs = JobState::ALL.map(|state| (state, 0));
+    let mut by_tenant: BTreeMap<String, TenantQueue> = BTreeMap::new();
     for row in connection.rows(counts).await? {
-        let state = rows::state(&row)?;
+        let (state, found) = (rows::state(&row)?, number(&row, "jobs")?);
         if let Some((_, count)) = jobs.iter_mut().find(|(known, _)| *known == state) {
-            *count = number(&row, "jobs")?;
+            *count += found;
+        }
+        if state.is_terminal() {
+            continue;
+        }
+        let tenant = row.text("tenant")?;
+        let queue = by_tenant.entry(tenant.clone()).or_insert(TenantQueue { tenant, queued: 0, running: 0 });
+        match state {
+            JobState::Queued => queue.queued = found,
+            _ => queue.running = found,
         }
     }
+    let mut by_tenant: Vec<TenantQueue> = by_tenant.into_values().collect();
+    by_tenant.sort_by_key(|of| (Reverse(of.queued), Reverse(of.running)));
+    by_tenant.truncate(tenants as usize);
     let oldest = Statement::new(
         "SELECT tenant, job, queue_time FROM jobs WHERE state = 'QUEUED' ORDER BY queue_time, id LIMIT 1",
     );
     let oldest = connection.optional_row(oldest).await?;
     let oldest = oldest.map(|row| Ok::<_, Error>((rows::name(&row)?, rows::time(row.integer("queue_time")?))));
-    let by_tenant = Statement::new(
-        "SELECT tenant, SUM(CASE WHEN state = 'QUEUED' THEN 1 ELSE 0 END) AS queued, \
-         SUM(CASE WHEN state = 'RUNNING' THEN 1 ELSE 0 END) AS running FROM jobs \
-         WHERE state IN ('QUEUED', 'RUNNING') GROUP BY tenant ORDER BY queued DESC, running DESC, tenant LIMIT $1",
-    );
-    let tenant = |row: &C::Row| {
-        Ok(TenantQueue {
-            tenant: row.text("tenant")?,
-            queued: number(row, "queued")?,
-            running: number(row, "running")?,
-        })
-    };
-    let tenants = connection.rows(by_tenant.bind(tenants)).await?.iter().map(tenant).collect::<Result<_, Error>>()?;
     let pause_time = pause.optional_integer("pause_time")?.map(rows::time);
-    Ok(QueueReport { pause_time, jobs, oldest: oldest.transpose()?, tenants })
+    Ok(QueueReport { pause_time, jobs, oldest: oldest.transpose()?, tenants: by_tenant })
 }

@@ -57,7 +57,7 @@ async fn next<C: Connection>(
     now: SystemTime,
     lease_now: SystemTime,
 ) -> Result<Option<LockedJob>, Error> {
-    for tenant in fairness::turns(connection, &claim.shares, lease_now).await? {
+    for tenant in fairness::turns(connection, claim, lease_now).await? {
         let first = Statement::new(select_locked_job!(
             "WHERE state = 'QUEUED' AND tenant = $1 AND (deadline IS NULL OR deadline > $2) \
              AND (lease_expires IS NULL OR lease_expires <= $3) ORDER BY priority DESC, create_time, id LIMIT 1"

@@ -16,7 +16,7 @@ use std::time::SystemTime;
 use super::rows::micros;
 use super::{Connection, Row, Statement};
 use crate::store::Error;
-use crate::store::record::TenantShares;
+use crate::store::record::{Claim, Lease, TenantShares};
 
 /// Virtual time between two jobs of a tenant of weight 1: a multiple of small weights, so that shares are exact.
 const STEP: i64 = 1_000_000;
@@ -36,7 +36,7 @@ pub(super) async fn register<C: Connection>(connection: &mut C, tenant: &str) ->
 /// * `lease_now`: now, on the clock of leases
 pub(super) async fn turns<C: Connection>(
     connection: &mut C,
-    shares: &TenantShares,
+    claim: &Claim,
     lease_now: SystemTime,
 ) -> Result<Vec<String>, Error> {
     // One step through the index for each tenant that waits, not for each job.
@@ -51,12 +51,12 @@ pub(super) async fn turns<C: Connection>(
          FROM waiting LEFT JOIN tenants ON tenants.tenant = waiting.tenant \
          WHERE waiting.tenant IS NOT NULL AND (SELECT pause_time FROM queue) IS NULL",
     );
-    let full = full(connection, shares, lease_now).await?;
+    let full = full(connection, claim, lease_now).await?;
     let mut turns = Vec::new();
     for row in connection.rows(select).await? {
         let tenant = row.text("tenant")?;
         if !full.contains(&tenant) {
-            turns.push((row.integer("virtual_start")?.saturating_add(step(shares, &tenant)), tenant));
+            turns.push((row.integer("virtual_start")?.saturating_add(step(&claim.shares, &tenant)), tenant));
         }
     }
     turns.sort_unstable();
@@ -66,17 +66,22 @@ pub(super) async fn turns<C: Connection>(
 /// Tenants with as many jobs running or prefetched as may run at once.
 async fn full<C: Connection>(
     connection: &mut C,
-    shares: &TenantShares,
+    claim: &Claim,
     lease_now: SystemTime,
 ) -> Result<HashSet<String>, Error> {
-    let Some(max_running) = shares.max_running else { return Ok(HashSet::new()) };
-    let select = Statement::new(
+    let Some(max_running) = claim.shares.max_running else { return Ok(HashSet::new()) };
+    let mut select = Statement::new(
         "SELECT tenant FROM ( \
-             SELECT tenant FROM jobs WHERE state = 'RUNNING' AND lease_expires IS NOT NULL \
-             UNION ALL SELECT tenant FROM jobs WHERE state = 'QUEUED' AND lease_expires > $1) AS leased \
-         GROUP BY tenant HAVING COUNT(*) >= $2",
-    );
-    let rows = connection.rows(select.bind(micros(lease_now)).bind(max_running)).await?;
+             SELECT tenant FROM jobs WHERE state = 'QUEUED' AND lease_expires > $1 \
+             UNION ALL SELECT tenant FROM jobs WHERE state = 'RUNNING' AND lease_expires IS NOT NULL",
+    )
+    .bind(micros(lease_now));
+    for Lease { name, attempt } in &claim.solved {
+        select = select.then(" AND NOT (tenant = ").then_bind(&name.tenant);
+        select = select.then(" AND job = ").then_bind(&name.job).then(" AND attempt = ").then_bind(*attempt).then(")");
+    }
+    let select = select.then(") AS leased GROUP BY tenant HAVING COUNT(*) >= ").then_bind(max_running);
+    let rows = connection.rows(select).await?;
     rows.iter().map(|row| row.text("tenant")).collect()
 }
 
