@@ -367,6 +367,8 @@ impl JobExecution {
             (None, _) => {
                 tracing::warn!("lease lost, the outcome is dropped");
                 observe::attempt_lost(AttemptLost::Fenced);
+                // Its end may have been stored all the same, only the answer was lost.
+                self.inner.notifier.wake(&self.job.name);
             }
         }
     }

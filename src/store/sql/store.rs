@@ -94,12 +94,13 @@ impl<D: Database> Store for D {
     }
 
     async fn claim(&self, claim: &Claim, now: SystemTime) -> Result<Claims, Error> {
+        // At once: `now` is what the wall clock showed at the call, and it may be set before the database answers.
+        let lease_now = self.lease_clock(now);
         // Idle workers look for jobs again and again: a read is one question over the network, a transaction is three.
         if D::SHARED && claim.begin.is_none() && !reads!(self, Size::Small, |connection| claims::may_claim(connection))?
         {
             return Ok(Claims::default());
         }
-        let lease_now = self.lease_clock(now);
         writes!(self, Size::Small, WriteIntent::Begins(0), [claim], |connection| claims::claim(
             connection, &claim, now, lease_now
         ))
@@ -211,8 +212,9 @@ impl<D: Database> Store for D {
     }
 
     async fn sweep(&self, now: SystemTime, max_attempts: u32) -> Result<Swept, Error> {
-        bounded(self, Size::Small, self.set_lease_clock()).await?;
+        // Before the clocks are compared: see `claim`.
         let expired_at = self.lease_clock(now);
+        bounded(self, Size::Small, self.set_lease_clock()).await?;
         // Most sweeps find nothing: a look spares the writer, and the disk, a transaction.
         if !reads!(self, Size::Small, |connection| attempts::needs_sweep(connection, expired_at, now))? {
             return Ok(Swept::default());

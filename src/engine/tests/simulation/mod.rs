@@ -163,7 +163,9 @@ impl<const SHARED: bool> Simulation<SHARED> {
         let Some(server) = &mut self.servers[place] else { return self.start(place) };
         let rng = &mut self.rng;
         let before = server.faults();
-        match rng.random_range(0..12) {
+        let what = rng.random_range(0..12);
+        tracing::info!(place, what, time = ?self.now, "a server is disturbed");
+        match what {
             0..=1 => self.kill(place),
             2 => server.drain(Duration::from_millis(rng.random_range(0..10_000))),
             3 => server.set(Faults { partitioned: true, ..before }),
@@ -236,6 +238,13 @@ fn a_seed_replays() {
     for seed in 0..20 {
         assert_eq!(simulate(seed, None), simulate(seed, None), "seed {seed}");
     }
+}
+
+#[test]
+#[ignore = "shows the log of a seed that failed"]
+fn a_seed_shows_its_log() {
+    tracing_subscriber::fmt().with_test_writer().init();
+    assert_eq!(simulate(first_seed(), None).err(), None);
 }
 
 #[test]
