@@ -10,7 +10,7 @@ use tonic::{Request, Response, Status};
 use tracing::Instrument;
 
 use super::caller::Caller;
-use super::convert::{create, job, list, names};
+use super::convert::{self, create, job, list, names};
 use super::inflight::{Permit, WORKING_COPIES};
 use super::submission::{self, Submission};
 use super::{proto, status};
@@ -244,7 +244,9 @@ impl proto::job_service_server::JobService for Jobs {
         let caller = Caller::of(&request)?;
         let name = caller.job(&request.get_ref().name)?;
         let proto::SetJobPriorityRequest { priority, etag, .. } = request.into_inner();
-        create::check_priority(priority, "priority").map_err(|found| status::invalid(&found.into()))?;
+        let checked = convert::required(priority, "priority")
+            .and_then(|priority| create::check_priority(priority, "priority").map(|()| priority));
+        let priority = checked.map_err(|found| status::invalid(&found.into()))?;
         let etag = Some(etag).filter(|etag| !etag.is_empty());
         let (engine, resource) = (self.engine.clone(), name.clone());
         let change =

@@ -125,7 +125,8 @@ impl Client {
     /// # Errors
     /// See [`Error`]; [`Error::Refused`] for one that does not wait.
     pub async fn set_priority(&mut self, name: &JobName, priority: i32) -> Result<Job, Error> {
-        let request = proto::SetJobPriorityRequest { name: name.to_string(), priority, etag: String::new() };
+        let request =
+            proto::SetJobPriorityRequest { name: name.to_string(), priority: Some(priority), etag: String::new() };
         let answer = self.jobs.set_job_priority(request).await;
         Ok(convert::job::from_wire(answer.map_err(|status| self.error(status))?.into_inner())?)
     }

@@ -94,7 +94,7 @@ async fn an_administrator_reaches_the_jobs_of_every_tenant() {
     let retry = proto::RetryJobRequest { name: name.clone(), etag: String::new() };
     assert_eq!(south.retry_job(retry.clone()).await.expect_err("another's").code(), Code::NotFound);
     assert_eq!(operator.retry_job(retry).await.expect("every tenant's").into_inner().state(), JobState::Queued);
-    let priority = proto::SetJobPriorityRequest { name: name.clone(), priority: 5, etag: String::new() };
+    let priority = proto::SetJobPriorityRequest { name: name.clone(), priority: Some(5), etag: String::new() };
     assert_eq!(south.set_job_priority(priority.clone()).await.expect_err("another's").code(), Code::NotFound);
     assert_eq!(operator.set_job_priority(priority).await.expect("every tenant's").into_inner().priority, 5);
     assert_eq!(north.get_job(proto::GetJobRequest { name }).await.expect("its own").into_inner().priority, 5);

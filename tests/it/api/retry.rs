@@ -117,20 +117,23 @@ async fn the_priority_of_a_waiting_job_can_be_changed() {
     let running = created(&mut jobs, create_tracks()).await;
     reaches(&mut jobs, &running, &[JobState::Running]).await;
     let waiting = created(&mut jobs, create_tracks()).await;
-    let mut set = async |name: &str, priority: i32, etag: &str| {
+    let mut set = async |name: &str, priority: Option<i32>, etag: &str| {
         let request = proto::SetJobPriorityRequest { name: name.into(), priority, etag: etag.into() };
         jobs.set_job_priority(request).await.map(tonic::Response::into_inner)
     };
-    let first = set(&waiting, 7, "").await.expect("it waits");
+    let first = set(&waiting, Some(7), "").await.expect("it waits");
     assert_eq!((first.priority, first.state()), (7, JobState::Queued));
-    let second = set(&waiting, -7, &first.etag).await.expect("as it was seen");
+    let second = set(&waiting, Some(-7), &first.etag).await.expect("as it was seen");
     assert_ne!(second.etag, first.etag);
-    let status = set(&waiting, 1, &first.etag).await.expect_err("has changed");
+    let status = set(&waiting, Some(1), &first.etag).await.expect_err("has changed");
     assert_eq!(reason(&status), "ETAG_MISMATCH");
-    let status = set(&waiting, 1_001, "").await.expect_err("out of range");
-    let violations = status.get_details_bad_request().expect("fields").field_violations;
-    assert_eq!((status.code(), violations[0].field.as_str()), (Code::InvalidArgument, "priority"));
-    let status = set(&running, 1, "").await.expect_err("it runs");
+    for refused in [Some(1_001), None] {
+        let status = set(&waiting, refused, "").await.expect_err("out of range, or not set");
+        let violations = status.get_details_bad_request().expect("fields").field_violations;
+        assert_eq!((status.code(), violations[0].field.as_str()), (Code::InvalidArgument, "priority"), "{refused:?}");
+    }
+    assert_eq!(set(&waiting, Some(0), "").await.expect("0 is a priority").priority, 0);
+    let status = set(&running, Some(1), "").await.expect_err("it runs");
     assert_eq!((status.code(), reason(&status).as_str()), (Code::FailedPrecondition, "JOB_NOT_QUEUED"));
     hold.let_go();
 }
