@@ -4,7 +4,7 @@ use std::net::IpAddr;
 use std::sync::Arc;
 use std::time::Duration;
 
-use axum::body::Body;
+use axum::body::{Body, BodyDataStream};
 use axum::extract::Request;
 use axum::http::uri::Authority;
 use axum::http::{HeaderMap, Method, header};
@@ -23,8 +23,11 @@ use super::origin::{self, Origin};
 use super::route::{self, Found, Route};
 use super::{Options, console, grpc_web, openapi, upload};
 use crate::domain::Violation;
+use crate::domain::error::quoted;
 use crate::domain::job::JobState;
+use crate::rpc::caller::Tenant;
 use crate::rpc::convert::enums::Twin;
+use crate::rpc::convert::names;
 use crate::rpc::inflight::Permit;
 use crate::rpc::listener::ConnectionInfo;
 use crate::rpc::proto::job_service_client::JobServiceClient;
@@ -103,12 +106,15 @@ impl Api {
             return Err(self.forbid(HttpRefusal::Host, text, &connection_info));
         }
         if *origin != Origin::Own && request.method() == Method::OPTIONS {
-            return Ok(origin::preflight());
+            return Ok(origin::preflight(&self.routes));
         }
+        let path = route::decode(request.uri().path()).map_err(|text| invalid("path", text))?;
         if grpc_web::is_call(request.headers()) {
+            if request.method() != Method::POST {
+                return Err(other_method(&path, &[Method::POST]));
+            }
             return Ok(grpc_web::answer(&self.gateway, connection_info, request).await);
         }
-        let path = request.uri().path().to_owned();
         let verb = if request.method() == Method::HEAD { Method::GET } else { request.method().clone() };
         let mut allowed = Vec::new();
         if path == OPENAPI_PATH && self.gateway.describes {
@@ -142,13 +148,15 @@ impl Api {
         if allowed.contains(&Method::GET) {
             allowed.push(Method::HEAD);
         }
-        let allowed = allowed.iter().map(Method::as_str).collect::<Vec<_>>().join(", ");
-        let refused = answer::refuse(HttpRefusal::Method, format!("{path} is for {allowed}"));
-        Err(Box::new(([(header::ALLOW, allowed)], *refused).into_response()))
+        Err(other_method(&path, &allowed))
     }
 
-    /// Whether the request has a key, where one is asked for.
-    pub(super) fn check_key(&self, headers: &HeaderMap, connection_info: &ConnectionInfo) -> Result<(), Box<Answer>> {
+    /// The tenant of the request's key, where one is asked for.
+    pub(super) fn check_key(
+        &self,
+        headers: &HeaderMap,
+        connection_info: &ConnectionInfo,
+    ) -> Result<Tenant, Box<Answer>> {
         let checked = self.gateway.check_key(headers, connection_info);
         checked.map_err(|status| answer::uncalled(HttpRefusal::Unauthenticated, &status))
     }
@@ -161,7 +169,7 @@ impl Api {
         request: Request,
     ) -> Result<Answer, Box<Answer>> {
         let (head, body) = request.into_parts();
-        self.check_key(&head.headers, &connection_info)?;
+        let tenant = self.check_key(&head.headers, &connection_info)?;
         let permit = self.gateway.permit();
         let descriptor = route.method.input();
         let query = head.uri.query().unwrap_or_default();
@@ -188,6 +196,12 @@ impl Api {
             route::set_field(&mut message, after, last_id).map_err(|text| invalid(after, text))?;
         }
         for (name, value) in fields {
+            let in_body = message.get_field_by_name(name).and_then(|field| field.as_str().map(str::to_owned));
+            if let Some(in_body) = in_body.filter(|text| !text.is_empty())
+                && names::resolved(&in_body, tenant.id()) != names::resolved(&value, tenant.id())
+            {
+                return Err(invalid(name, format!("{} is not the path's {value}", quoted(&in_body))));
+            }
             route::set_field(&mut message, name, &value).map_err(|text| invalid(name, text))?;
         }
         if let Some(after) = message.get_field_by_name(after).and_then(|number| number.as_u64()).filter(|&n| n > 0)
@@ -248,8 +262,8 @@ impl Api {
         if text.is_empty() {
             return Ok((DynamicMessage::new(descriptor), 0));
         }
-        let kind = headers.get(header::CONTENT_TYPE).and_then(|kind| kind.to_str().ok()).unwrap_or_default();
-        if kind.split(';').next().unwrap_or_default().trim() != "application/json" {
+        let kind = media_type(headers);
+        if kind != "application/json" {
             let text = format!("the body is {kind:?}, not application/json");
             return Err(answer::refuse(HttpRefusal::MediaType, text));
         }
@@ -267,12 +281,7 @@ impl Api {
     async fn collect(&self, body: Body, permit: &Permit) -> Result<Vec<u8>, Box<Answer>> {
         let mut text = Vec::new();
         let mut frames = body.into_data_stream();
-        loop {
-            let frame = tokio::time::timeout(BODY_PATIENCE, frames.next()).await;
-            let stalled = |_| answer::uncalled(HttpRefusal::Stalled, &status::input_stalled(BODY_PATIENCE));
-            let Some(frame) = frame.map_err(stalled)? else { break };
-            // The client has gone away; nobody reads the answer.
-            let frame = frame.map_err(|error| failed(Status::cancelled(error.to_string())))?;
+        while let Some(frame) = next_frame(&mut frames).await? {
             let length = text.len() + frame.len();
             if length > self.options.max_body_bytes {
                 let text = format!(
@@ -286,6 +295,14 @@ impl Api {
         }
         Ok(text)
     }
+}
+
+/// The next bytes of a body; `None` at its end.
+pub(super) async fn next_frame(frames: &mut BodyDataStream) -> Result<Option<Bytes>, Box<Answer>> {
+    let frame = tokio::time::timeout(BODY_PATIENCE, frames.next()).await;
+    let frame = frame.map_err(|_| answer::uncalled(HttpRefusal::Stalled, &status::input_stalled(BODY_PATIENCE)))?;
+    // The client has gone away; nobody reads the answer.
+    frame.transpose().map_err(|error| failed(Status::cancelled(error.to_string())))
 }
 
 /// A call with what the request says of its caller.
@@ -306,6 +323,19 @@ pub(super) fn call<T>(
     call.extensions_mut().insert(connection_info);
     call.extensions_mut().insert(permit);
     call
+}
+
+/// The media type of a body in lowercase, without parameters (RFC 9110, section 8.3.1).
+pub(super) fn media_type(headers: &HeaderMap) -> String {
+    let kind = headers.get(header::CONTENT_TYPE).and_then(|kind| kind.to_str().ok()).unwrap_or_default();
+    kind.split(';').next().unwrap_or_default().trim().to_ascii_lowercase()
+}
+
+/// The refusal of a method, which names those that the path has.
+fn other_method(path: &str, allowed: &[Method]) -> Box<Answer> {
+    let allowed = allowed.iter().map(Method::as_str).collect::<Vec<_>>().join(", ");
+    let refused = answer::refuse(HttpRefusal::Method, format!("{path} is for {allowed}"));
+    Box::new(([(header::ALLOW, allowed)], *refused).into_response())
 }
 
 pub(super) fn failed(status: Status) -> Box<Answer> {

@@ -1,14 +1,16 @@
 //! Pages of other sites: which may call the API, and what their browsers are told (Fetch standard, "CORS protocol").
 
+use std::collections::BTreeSet;
+
 use axum::http::{HeaderMap, HeaderName, HeaderValue, StatusCode, header};
 use axum::response::IntoResponse;
 
 use super::answer::Answer;
+use super::route::Route;
 
 /// What such a page may send: JSON, a key, and what clients of gRPC-Web add.
 const REQUEST_HEADERS: &str = "authorization, content-type, grpc-timeout, last-event-id, traceparent, tracestate, \
                                x-grpc-web, x-user-agent";
-const METHODS: &str = "GET, POST, DELETE, PATCH";
 /// What it may read: how a call of gRPC ended, and when to come back.
 const ANSWER_HEADERS: &str = "grpc-message, grpc-status, grpc-status-details-bin, retry-after";
 /// Seconds that a browser remembers the permission: Chromium remembers none for longer.
@@ -43,12 +45,13 @@ impl Origin {
     }
 }
 
-/// The answer to a browser that asks whether a page of an allowed origin may call.
-pub fn preflight() -> Answer {
+/// The answer to a browser that asks whether a page of an allowed origin may call: by the methods that any route has.
+pub fn preflight(routes: &[Route]) -> Answer {
+    let methods: BTreeSet<&str> = routes.iter().map(|route| route.verb.as_str()).collect();
     let permission = [
-        (header::ACCESS_CONTROL_ALLOW_METHODS, METHODS),
-        (header::ACCESS_CONTROL_ALLOW_HEADERS, REQUEST_HEADERS),
-        (header::ACCESS_CONTROL_MAX_AGE, REMEMBERED_SECONDS),
+        (header::ACCESS_CONTROL_ALLOW_METHODS, methods.into_iter().collect::<Vec<_>>().join(", ")),
+        (header::ACCESS_CONTROL_ALLOW_HEADERS, REQUEST_HEADERS.to_owned()),
+        (header::ACCESS_CONTROL_MAX_AGE, REMEMBERED_SECONDS.to_owned()),
     ];
     (StatusCode::NO_CONTENT, permission).into_response()
 }

@@ -69,6 +69,26 @@ fn route(method: &MethodDescriptor, rule: &DynamicMessage) -> Result<Route, Stri
     })
 }
 
+/// A path with its percent-encoded bytes decoded, once. An encoded `/` is left as it is: decoded it would separate
+/// segments, and no name holds one.
+///
+/// # Errors
+/// What is wrong with the encoding.
+pub fn decode(path: &str) -> Result<String, &'static str> {
+    let mut parts = path.split('%');
+    let mut decoded = parts.next().unwrap_or_default().as_bytes().to_vec();
+    for part in parts {
+        let digits = part.get(..2).filter(|digits| digits.bytes().all(|digit| digit.is_ascii_hexdigit()));
+        let byte = digits.and_then(|digits| u8::from_str_radix(digits, 16).ok());
+        match byte.ok_or("has a % without two hexadecimal digits after it")? {
+            b'/' => decoded.extend_from_slice(b"%2F"),
+            byte => decoded.push(byte),
+        }
+        decoded.extend_from_slice(&part.as_bytes()[2..]);
+    }
+    String::from_utf8(decoded).map_err(|_| "is not UTF-8 once it is decoded")
+}
+
 /// Finds the route of a request.
 pub fn find<'a>(routes: &'a [Route], verb: &Method, path: &str) -> Found<'a> {
     let mut others = Vec::new();
@@ -216,6 +236,23 @@ pub fn set_field(message: &mut DynamicMessage, name: &str, text: &str) -> Result
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn paths_are_decoded_once_and_keep_their_segments() {
+        for (path, decoded) in [
+            ("/v1/tenants/%2d/jobs", "/v1/tenants/-/jobs"),
+            ("/v1/tenants/-/jobs/ja%3Acancel", "/v1/tenants/-/jobs/ja:cancel"),
+            ("/v1/tenants/a%2fjobs%2Fb", "/v1/tenants/a%2Fjobs%2Fb"),
+            ("/%25%32%66", "/%2f"),
+            ("/%C3%A9", "/\u{e9}"),
+            ("", ""),
+        ] {
+            assert_eq!(decode(path).as_deref(), Ok(decoded), "{path}");
+        }
+        for bad in ["/%", "/%2", "/a%2/b", "/%zz", "/%+1", "/%\u{e9}", "/%ff"] {
+            assert!(decode(bad).is_err(), "{bad}");
+        }
+    }
 
     #[test]
     fn paths_are_taken_apart_by_their_patterns() {

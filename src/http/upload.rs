@@ -12,7 +12,7 @@ use sha2::{Digest, Sha256};
 use tonic::Code;
 
 use super::answer::{self, Answer};
-use super::api::{Api, call, failed, in_background, invalid};
+use super::api::{Api, call, failed, in_background, invalid, media_type, next_frame};
 use crate::rpc::convert::size_to_wire;
 use crate::rpc::inputs::MAX_CHUNK_BYTES;
 use crate::rpc::listener::ConnectionInfo;
@@ -52,9 +52,7 @@ pub async fn answer(
         upload_id = Some(value.into_owned());
     }
     let permit = api.gateway.permit();
-    let kind = head.headers.get(header::CONTENT_TYPE).and_then(|kind| kind.to_str().ok()).unwrap_or_default();
-    let is_protobuf = kind.split(';').next().unwrap_or_default().trim() == PROTOBUF;
-    let (size_bytes, body) = if is_protobuf {
+    let (size_bytes, body) = if media_type(&head.headers) == PROTOBUF {
         (declared_length(&head.headers)?, body)
     } else {
         let (message, length) = api.read(&head.headers, body, api.input_data.clone(), &permit).await?;
@@ -62,7 +60,8 @@ pub async fn answer(
         permit.hold(encoded.len() as u64).map_err(failed)?;
         (encoded.len() as u64, Body::from(encoded))
     };
-    let start = proto::UploadStart {
+    let mut body = body.into_data_stream();
+    let mut start = proto::UploadStart {
         parent,
         upload_id: upload_id.unwrap_or_else(|| uuid::Uuid::now_v7().to_string()),
         size_bytes: size_to_wire(size_bytes),
@@ -72,12 +71,22 @@ pub async fn answer(
     let asked = proto::GetUploadStatusRequest { parent: start.parent.clone(), upload_id: start.upload_id.clone() };
     let asked = call(&head.headers, connection_info.clone(), permit.clone(), asked);
     // What an upload that broke off has left is kept: the body is passed over that far.
-    let committed = match client.get_upload_status(asked).await {
-        Ok(status) => u64::try_from(status.into_inner().committed_bytes).unwrap_or(0),
+    let committed = match client.get_upload_status(asked).await.map(tonic::Response::into_inner) {
+        // A finished upload is answered at its start, before any byte is compared: the start has to tell the SHA-256,
+        // so that an id that comes with other bytes is refused.
+        Ok(proto::UploadStatus { input: Some(_), size_bytes, .. }) if size_bytes == start.size_bytes => {
+            let mut hash = Sha256::new();
+            while let Some(frame) = next_frame(&mut body).await? {
+                hash.update(&frame);
+            }
+            start.sha256 = hash.finalize().to_vec();
+            0
+        }
+        Ok(status) => u64::try_from(status.committed_bytes).unwrap_or(0),
         Err(status) if status.code() == Code::NotFound => 0,
         Err(status) => return Err(failed(status)),
     };
-    let messages = messages(start, committed, body.into_data_stream());
+    let messages = messages(start, committed, body);
     let uploaded =
         client.upload_input(call(&head.headers, connection_info, permit.clone(), messages)).await.map_err(failed)?;
     let json = answer::message(&api.input, &uploaded.into_inner().encode_to_vec()).map_err(failed)?;

@@ -51,12 +51,12 @@ impl Authenticate {
         self.keys.is_some()
     }
 
-    /// Whether these headers hold a key, where one is asked for.
+    /// The tenant of the key that these headers hold; where none is asked for, everyone's.
     ///
     /// # Errors
     /// `UNAUTHENTICATED`.
-    pub fn check(&self, headers: &HeaderMap) -> Result<(), Status> {
-        self.admit(headers).map(drop)
+    pub fn check(&self, headers: &HeaderMap) -> Result<Tenant, Status> {
+        self.admit(headers).map(|(tenant, _)| tenant)
     }
 
     /// Whose call it is, and what it hangs on.

@@ -22,6 +22,7 @@ use tower::layer::util::{Identity, Stack};
 use super::admin::Admin;
 use super::auth::{Authenticate, Authenticated};
 use super::calibration::{self, Calibration};
+use super::caller::Tenant;
 use super::error_details::{ErrorDetailsLayer, ErrorDetailsService};
 use super::inflight::{Budget, Charged, Inflight, Permit};
 use super::inputs::{self, Inputs};
@@ -380,15 +381,16 @@ pub struct Gateway {
 }
 
 impl Gateway {
-    /// Whether the headers hold a key, where one is asked for: before a request is read that only a call will refuse.
-    /// Its connection may stay then.
+    /// The tenant of the key that the headers hold, where one is asked for: before a request is read that only a call
+    /// will refuse. Its connection may stay then.
     ///
     /// # Errors
     /// `UNAUTHENTICATED`.
-    pub fn check_key(&self, headers: &HeaderMap, connection_info: &ConnectionInfo) -> Result<(), Status> {
-        self.authenticate.check(headers).inspect_err(|status| self.log_refused(status, connection_info))?;
+    pub fn check_key(&self, headers: &HeaderMap, connection_info: &ConnectionInfo) -> Result<Tenant, Status> {
+        let checked = self.authenticate.check(headers);
+        let tenant = checked.inspect_err(|status| self.log_refused(status, connection_info))?;
         connection_info.set_authenticated();
-        Ok(())
+        Ok(tenant)
     }
 
     /// Writes down that a request was refused before it became a call.

@@ -137,7 +137,7 @@ fn pages_of_named_origins_may_call_and_no_others() {
     assert!(permission.starts_with("http/1.1 204"), "{permission}");
     for line in [
         "access-control-allow-origin: https://app.example",
-        "access-control-allow-methods: get, post, delete, patch",
+        "access-control-allow-methods: delete, get, post",
         "vary: origin",
     ] {
         assert!(permission.lines().any(|told| told == line), "{line} is not in {permission}");
@@ -147,6 +147,9 @@ fn pages_of_named_origins_may_call_and_no_others() {
     let listed = call(&server, "JobService/ListJobs", &list, &[("origin", APP)]);
     assert!(listed.has_status(0) && listed.head.contains("access-control-allow-origin: https://app.example"));
     assert!(listed.head.contains("access-control-expose-headers: grpc-message, grpc-status"), "{}", listed.head);
+    let kind = [("content-type", "application/grpc-web")];
+    let (read, _) = exchange(&server, "GET", path, &kind, &[]);
+    assert!(read.starts_with("http/1.1 405") && read.lines().any(|told| told == "allow: post"), "{read}");
     // JSON likewise.
     let (json, _) = exchange(&server, "GET", "/v1/capabilities", &[("origin", APP)], &[]);
     assert!(json.starts_with("http/1.1 200") && json.contains("access-control-allow-origin: https://app.example"));

@@ -256,6 +256,70 @@ fn what_is_wrong_is_told_by_field_and_nothing_is_stored() {
 }
 
 #[test]
+fn a_body_that_names_another_resource_than_the_path_is_refused() {
+    let (_data, server) = serving();
+    let created = post(&server, "/v1/tenants/-/jobs", &json!({"trackSet": tracks(), "parent": "tenants/default"}));
+    assert_eq!(created.code, 200, "{}", created.text());
+    let job = path_of(&created.json());
+    let of_caller = job.replace("tenants/default", "tenants/-");
+    let name = &created.json()["name"];
+    let other = "tenants/default/jobs/other";
+    let refused = |path: &str, body: &Value, field: &str| {
+        let answer = post(&server, path, body);
+        assert_eq!((answer.code, answer.refusal()), (400, ("INVALID_ARGUMENT".into(), field.into())), "{body}");
+    };
+    for parent in ["tenants/acme", "default"] {
+        refused("/v1/tenants/-/jobs", &json!({"trackSet": tracks(), "parent": parent}), "parent");
+        let batch = json!({"parent": parent, "requests": [{"trackSet": tracks()}]});
+        refused("/v1/tenants/default/jobs:batchCreate", &batch, "parent");
+    }
+    for path in [&job, &of_caller] {
+        refused(&format!("{path}:cancel"), &json!({"name": other}), "name");
+        refused(&format!("{path}:setPriority"), &json!({"name": other, "priority": 1}), "name");
+        // The same by another spelling.
+        for same in [name.clone(), json!(of_caller.trim_start_matches("/v1/")), json!("")] {
+            assert_eq!(post(&server, &format!("{path}:cancel"), &json!({"name": same})).code, 200, "{same}");
+        }
+    }
+    // A priority that is left out is not 0.
+    for body in [json!({}), json!({"name": name}), json!({"priority": null})] {
+        refused(&format!("{job}:setPriority"), &body, "priority");
+    }
+    let none = request(&server, "POST", &format!("{job}:setPriority"), &[], &[]);
+    assert_eq!((none.code, none.refusal().1.as_str()), (400, "priority"));
+    let listed = get(&server, "/v1/tenants/-/jobs").json();
+    assert_eq!(listed["jobs"].as_array().map(Vec::len), Some(1), "{listed}");
+}
+
+#[test]
+fn paths_and_media_types_are_read_in_every_spelling() {
+    let (_data, server) = serving();
+    let body = json!({"trackSet": tracks()}).to_string();
+    for kind in ["application/JSON", "Application/Json; charset=UTF-8", "application/json;charset=utf-8"] {
+        let created = request(&server, "POST", "/v1/tenants/%2d/jobs", &[("content-type", kind)], body.as_bytes());
+        assert_eq!(created.code, 200, "{kind}: {}", created.text());
+    }
+    let data = Some(proto::input_data::Data::TrackSet(track_set()));
+    let bytes = proto::InputData { data }.encode_to_vec();
+    let kind = [("content-type", "Application/X-Protobuf; messageType=scpsfm.v1.InputData")];
+    let uploaded = request(&server, "POST", "/v1/tenants/%64efault/inputs", &kind, &bytes);
+    assert_eq!(uploaded.code, 200, "{}", uploaded.text());
+    let created = post(&server, "/v1/tenants/-/jobs%3AbatchCreate", &json!({"requests": [{"trackSet": tracks()}]}));
+    assert_eq!(created.code, 200, "{}", created.text());
+    let job = path_of(&created.json()["jobs"][0]);
+    assert_eq!(post(&server, &format!("{job}%3acancel"), &json!({})).code, 200);
+    // An encoded slash is part of a segment, and no id has one; what is decoded is not decoded again.
+    for odd in ["/v1/tenants/default%2Fjobs", "/v1/tenants/a%2fb/jobs", "/v1/tenants/%252d/jobs"] {
+        let answer = get(&server, odd);
+        assert!([400, 404].contains(&answer.code), "{odd}: {}", answer.text());
+    }
+    for bad in ["/v1/tenants/%/jobs", "/v1/tenants/%2/jobs", "/v1/tenants/%zz/jobs", "/v1/tenants/%ff/jobs"] {
+        let answer = get(&server, bad);
+        assert_eq!((answer.code, answer.refusal()), (400, ("INVALID_ARGUMENT".into(), "path".into())), "{bad}");
+    }
+}
+
+#[test]
 fn a_body_is_bounded_and_costs_its_own_connection() {
     let data = tempfile::tempdir().expect("a temporary directory");
     let bound = [("SCPSFM_HTTP__MAX_BODY_BYTES", "10000")];
@@ -297,6 +361,19 @@ fn an_input_is_uploaded_as_json_or_protobuf_and_solved() {
     );
     let again = request(&server, "POST", &named, &protobuf, &bytes);
     assert_eq!(again.json(), by_protobuf.json(), "{}", again.text());
+    // Other bytes of the same length under the same id are refused, whichever way they come.
+    let mut other = track_set();
+    other.xs[0] += 1.0;
+    let other = proto::InputData { data: Some(proto::input_data::Data::TrackSet(other)) }.encode_to_vec();
+    assert_eq!(other.len(), bytes.len());
+    let reused = request(&server, "POST", &named, &protobuf, &other);
+    assert_eq!((reused.code, reused.refusal().0.as_str()), (409, "UPLOAD_ID_REUSED"), "{}", reused.text());
+    let mut other = tracks();
+    other["xs"][0] = json!(other["xs"][0].as_f64().expect("a number") + 1.0);
+    let named = "/v1/tenants/-/inputs?uploadId=0195fa4c-0000-7000-8000-000000000001";
+    let reused = post(&server, named, &json!({"trackSet": other}));
+    assert_eq!((reused.code, reused.refusal().0.as_str()), (409, "UPLOAD_ID_REUSED"), "{}", reused.text());
+    assert_eq!(post(&server, named, &json!({"trackSet": tracks()})).json(), by_json.json());
     let damaged = request(&server, "POST", "/v1/tenants/-/inputs", &protobuf, &bytes[1..]);
     assert_eq!((damaged.code, damaged.refusal().1.as_str()), (400, "data"));
     // The same numbers to the last bit, also those that decimals of 16 and 17 digits stand for.

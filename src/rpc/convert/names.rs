@@ -47,10 +47,10 @@ pub fn input(name: &str, field: &str, own: &str) -> Result<InputName, InvalidInp
 }
 
 /// A name with the tenant's id in the place of `-`.
-fn resolved<'a>(name: &'a str, own: &str) -> Cow<'a, str> {
-    match name.strip_prefix("tenants/-/") {
-        Some(rest) => format!("tenants/{own}/{rest}").into(),
-        None => name.into(),
+pub fn resolved<'a>(name: &'a str, own: &str) -> Cow<'a, str> {
+    match name.strip_prefix("tenants/-") {
+        Some(rest) if rest.is_empty() || rest.starts_with('/') => format!("tenants/{own}{rest}").into(),
+        _ => name.into(),
     }
 }
 
@@ -70,6 +70,7 @@ mod tests {
 
     #[test]
     fn a_dash_is_the_tenant_that_calls() {
+        assert_eq!(super::resolved("tenants/-", "own"), "tenants/own");
         let job = super::job("tenants/-/jobs/a", "own").expect("a name");
         assert_eq!(job.to_string(), "tenants/own/jobs/a");
         let input = super::input("tenants/-/inputs/b", "input", "own").expect("a name");
