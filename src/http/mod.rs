@@ -50,8 +50,9 @@ use api::Api;
 /// Protocol that clients over TLS are offered.
 const HTTP_1: &[u8] = b"http/1.1";
 
-/// Largest body of JSON: an input of some 300,000 observations, and at 60 bytes a byte, which the worst JSON takes in
-/// memory, what all calls may hold by default. Larger inputs are uploaded as protobuf.
+/// Largest body of JSON: an input of some 300,000 observations. At 60 bytes a byte, which the worst JSON takes in
+/// memory, it leaves room for some 20,000 objects in what all calls may hold by default. Larger inputs are uploaded as
+/// protobuf.
 pub const MAX_BODY_BYTES: usize = 16 << 20;
 
 /// How long a request's head may take, and a connection may wait for the next one.

@@ -107,6 +107,11 @@ impl Permit {
         self.change(|charge| charge.held = bytes)
     }
 
+    /// Whether the whole budget is as much.
+    pub fn could_hold(&self, bytes: u64) -> bool {
+        bytes <= self.shared.budget.max_bytes
+    }
+
     /// The call holds so many bytes more.
     ///
     /// # Errors

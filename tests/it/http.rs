@@ -341,6 +341,21 @@ fn a_body_is_bounded_and_costs_its_own_connection() {
 }
 
 #[test]
+fn a_body_of_more_objects_than_the_memory_holds_is_refused_unread() {
+    let (_data, server) = serving();
+    // Decoded, each of the three bytes would be hundreds.
+    let objects = "{},".repeat(2_000_000);
+    let json = [("content-type", "application/json")];
+    for (path, begin) in [("jobs", "{\"trackSet\":{\"views\":["), ("jobs:batchCreate", "{\"requests\":[")] {
+        let body = format!("{begin}{objects}");
+        let refused = request(&server, "POST", &format!("/v1/tenants/-/{path}"), &json, body.as_bytes());
+        assert_eq!((refused.code, refused.refusal().0.as_str()), (413, "MESSAGE_TOO_LARGE"), "{path}");
+    }
+    assert_eq!(Page::parse(&server.page("/metrics")).value("scpsfm_inflight_bytes"), 0.0, "nothing is held");
+    assert_eq!(post(&server, "/v1/tenants/-/jobs", &json!({"trackSet": tracks()})).code, 200);
+}
+
+#[test]
 fn an_input_is_uploaded_as_json_or_protobuf_and_solved() {
     let (_data, server) = serving();
     let by_json = post(
