@@ -188,9 +188,10 @@ class JobServiceServicer(object):
 
     def RetryJob(self, request, context):
         """Puts a job that ended without a result (FAILED, CANCELLED or DEADLINE_EXCEEDED) into the queue again. It keeps its
-        name, input, settings, labels and priority. Its lost attempts are counted anew, `attempt` goes on, and its events
-        go on with the next sequence number. `error`, `start_time` and `end_time` of the earlier end are removed, and a
-        deadline that has passed. It depends on no `Solve` any more.
+        name, input, settings, labels and priority. Its lost attempts are counted anew, `attempt_count` goes on, and its
+        events go on with the next sequence number. `error`, `start_time` and `end_time` of the earlier end are removed,
+        and a deadline that has passed. Its webhook is PENDING again, with no attempts, and is sent at the new end. It
+        depends on no `Solve` any more.
 
         A job that waits or runs is answered as it is, so that the call is safe to repeat. FAILED_PRECONDITION (reason
         JOB_SUCCEEDED) for a job that has succeeded; ABORTED for an `etag` that is not the job's; RESOURCE_EXHAUSTED
