@@ -281,9 +281,7 @@ pub fn lost(error: client::Error, job: &Lost) -> Failure {
     }
     let mut failure = Failure::from(error);
     let commands = taken_up_again(job);
-    failure
-        .message
-        .push_str(&format!("\nthe job is {}; a server that comes back goes on with it:\n{commands}", job.name));
+    failure.message.push_str(&format!("\nthe job is {}; once the server answers again:\n{commands}", job.name));
     failure
 }
 

@@ -18,7 +18,7 @@ use tonic_types::StatusExt;
 
 use crate::http::request;
 use crate::support::keys::{Keyed, NORTH, SOUTH, keyed};
-use crate::support::program::Serving;
+use crate::support::program::{Serving, run};
 use crate::support::scrape::Page;
 use crate::support::server::{TestServer, one_worker};
 use crate::support::solvers::quick;
@@ -82,4 +82,55 @@ fn a_tenant_that_creates_too_many_jobs_is_refused_over_http_alike() {
     assert!(second.has("retry-after: "), "{}", second.head);
     let page = Page::parse(&server.page("/metrics"));
     assert_eq!(page.value("scpsfm_admission_refusals_total{reason=\"RATE_LIMITED\",bound=\"jobs\"}"), 1.0);
+}
+
+/// Jobs of one call, for which a rate of one a second makes a client wait longer than it does.
+const TOO_MANY: usize = 60;
+
+#[test]
+fn the_program_waits_as_a_rate_tells_it_and_no_longer_than_it_says() {
+    let directory = tempfile::tempdir().expect("a temporary directory");
+    let rates = [
+        ("SCPSFM_RATES__CALLS_PER_SECOND", "1"),
+        ("SCPSFM_RATES__CALLS_BURST", "2"),
+        ("SCPSFM_RATES__JOBS_PER_SECOND", "1"),
+    ];
+    let server = Serving::start_with(&directory.path().join("data"), &rates, Stdio::null());
+    let scene = directory.path().join("scene");
+    let path = |path: &std::path::Path| path.to_str().expect("UTF-8").to_owned();
+    let made = run(["synth", "--views", "4", "--tracks", "30", "--outliers", "0.2", "--out", path(&scene).as_str()]);
+    assert_eq!(made.code, Some(0), "{made:?}");
+    let input = path(&scene.join("observations.csv"));
+    let on = ["--server", server.grpc.as_str()];
+    let submit = |count: usize| {
+        let inputs = vec![input.as_str(); count];
+        run(["submit", "--method", "geometry"].iter().copied().chain(inputs).chain(on))
+    };
+    // One call for all of them, then one for each page: more than the burst, at once.
+    let submitted = submit(4);
+    assert_eq!((submitted.code, submitted.stdout.lines().count()), (Some(0), 4), "{submitted:?}");
+    let listed = run(["list", "--all", "--page-size", "1"].iter().copied().chain(on));
+    assert_eq!((listed.code, listed.stdout.lines().count()), (Some(0), 4), "{listed:?}");
+    let name = submitted.stdout.lines().next().expect("a name");
+    for command in [vec!["watch", name], vec!["get", name], vec!["priority", name, "1"]] {
+        let run = run(command.iter().copied().chain(on));
+        assert_ne!(run.code, Some(69), "{command:?}: {run:?}");
+    }
+
+    // All jobs that come at once after a pause: none of them is one, and they count all the same.
+    let batch = json!({"requests": vec![json!({}); 1_000]}).to_string();
+    loop {
+        let headers = [("content-type", "application/json")];
+        let answer = request(&server, "POST", "/v1/tenants/-/jobs:batchCreate", &headers, batch.as_bytes());
+        if answer.code == 400 {
+            break;
+        }
+        assert_eq!((answer.code, answer.refusal().0.as_str()), (429, "RATE_LIMITED"));
+        std::thread::sleep(Duration::from_millis(200));
+    }
+    let refused = submit(TOO_MANY);
+    assert_eq!(refused.code, Some(69), "{refused:?}");
+    assert!(refused.stderr.contains("rates.jobs_per_second"), "{refused:?}");
+    assert_eq!(refused.stderr.matches("come back in").count(), 1, "told once: {refused:?}");
+    assert!(!refused.stderr.contains("try again") && !refused.stderr.contains("waiting"), "{refused:?}");
 }

@@ -9,8 +9,8 @@ impl Client {
     /// # Errors
     /// See [`Error`].
     pub async fn queue(&mut self) -> Result<proto::Queue, Error> {
-        let answer = self.admin.get_queue(proto::GetQueueRequest {}).await;
-        Ok(answer.map_err(|status| self.error(status))?.into_inner())
+        self.call(proto::GetQueueRequest {}, |mut client, request| async move { client.admin.get_queue(request).await })
+            .await
     }
 
     /// Pauses the queue.
@@ -18,8 +18,11 @@ impl Client {
     /// # Errors
     /// See [`Error`].
     pub async fn pause_queue(&mut self) -> Result<proto::Queue, Error> {
-        let answer = self.admin.pause_queue(proto::PauseQueueRequest {}).await;
-        Ok(answer.map_err(|status| self.error(status))?.into_inner())
+        self.call(
+            proto::PauseQueueRequest {},
+            |mut client, request| async move { client.admin.pause_queue(request).await },
+        )
+        .await
     }
 
     /// Ends a pause of the queue.
@@ -27,8 +30,10 @@ impl Client {
     /// # Errors
     /// See [`Error`].
     pub async fn resume_queue(&mut self) -> Result<proto::Queue, Error> {
-        let answer = self.admin.resume_queue(proto::ResumeQueueRequest {}).await;
-        Ok(answer.map_err(|status| self.error(status))?.into_inner())
+        self.call(proto::ResumeQueueRequest {}, |mut client, request| async move {
+            client.admin.resume_queue(request).await
+        })
+        .await
     }
 
     /// Has the server that answers drain and end. Returns its name.
@@ -36,7 +41,9 @@ impl Client {
     /// # Errors
     /// See [`Error`].
     pub async fn drain_server(&mut self) -> Result<String, Error> {
-        let answer = self.admin.drain_server(proto::DrainServerRequest {}).await;
-        Ok(answer.map_err(|status| self.error(status))?.into_inner().worker)
+        let server = self.call(proto::DrainServerRequest {}, |mut client, request| async move {
+            client.admin.drain_server(request).await
+        });
+        Ok(server.await?.worker)
     }
 }

@@ -98,15 +98,15 @@ impl Backoff {
         self.trouble.as_ref().is_some_and(|trouble| trouble.may_be_done)
     }
 
-    /// Waits for the next try; `false` when there is none.
-    pub async fn pause(&mut self) -> bool {
+    /// Waits for the next try, for no less than `at_least`; `false` when there is none.
+    pub async fn pause(&mut self, at_least: Duration) -> bool {
         let Some(&pause_ms) = PAUSES_MS.get(self.tries) else { return false };
         let now = Instant::now();
         // The last pause is cut short, not left out: what was said to be the wait is the wait.
         let last = self.trouble.as_ref().map(|trouble| trouble.end - LAST_TRY);
-        let wanted = now + Duration::from_millis(pause_ms);
+        let wanted = now + Duration::from_millis(pause_ms).max(at_least);
         let next = last.map_or(wanted, |last| wanted.min(last));
-        if next <= now {
+        if next <= now || next < now + at_least {
             return false;
         }
         self.tries += 1;
@@ -144,7 +144,7 @@ mod tests {
                 let status = backoff.within(call).await.expect_err("away");
                 assert_eq!(status.message(), "away");
                 backoff.failed(&status);
-                if !backoff.pause().await {
+                if !backoff.pause(Duration::ZERO).await {
                     return (begun.elapsed().as_secs_f64() - try_for.as_secs_f64(), tries);
                 }
             }
@@ -199,11 +199,28 @@ mod tests {
             // In the place of the pause.
             backoff.tries += 1;
         }
-        assert!(!runtime.block_on(backoff.pause()), "no pause is left");
+        assert!(!runtime.block_on(backoff.pause(Duration::ZERO)), "no pause is left");
         // The time for which a stream lived is no time of trouble.
         backoff.accepted = Some(some_time_ago(LIVED / 2));
         assert!(!backoff.failed(&away));
         assert!(backoff.trouble.as_ref().expect("trouble").end >= end + LIVED / 2);
+    }
+
+    /// As after a refusal that says when the call would pass.
+    #[test]
+    fn a_pause_is_as_long_as_it_must_be_or_there_is_none() {
+        let clock = tokio::runtime::Builder::new_current_thread().enable_time().start_paused(true).build();
+        clock.expect("a runtime").block_on(async {
+            let mut backoff = Backoff::default();
+            backoff.failed(&Status::resource_exhausted("too many"));
+            let begun = Instant::now();
+            assert!(backoff.pause(Duration::from_secs(7)).await);
+            let waited = begun.elapsed();
+            assert!(waited >= Duration::from_secs(7) && waited < Duration::from_secs(8), "{waited:?}");
+            assert!(!backoff.pause(Backoff::TOTAL).await, "it would end after the time of trouble");
+            assert_eq!(begun.elapsed(), waited, "which is known before it begins");
+            assert!(backoff.pause(Duration::ZERO).await, "the pauses that are left go on");
+        });
     }
 
     #[test]

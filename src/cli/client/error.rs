@@ -2,6 +2,7 @@
 
 use std::error::Error as _;
 use std::io;
+use std::time::Duration;
 
 use tonic::{Code, Status};
 use tonic_types::StatusExt;
@@ -97,8 +98,9 @@ impl Error {
         match status.code() {
             Code::Unavailable => Error::Unavailable(format!("{server}: {message}")),
             Code::ResourceExhausted => {
-                let retry = status.get_details_retry_info().and_then(|info| info.retry_delay);
-                let hint = retry.map(|delay| format!("; try again in {} s", delay.as_secs_f64())).unwrap_or_default();
+                // Of a rate the message itself tells the time.
+                let delay = retry_delay(status).filter(|_| rate_limit_wait(status).is_none());
+                let hint = delay.map(|delay| format!("; try again in {} s", tenths(delay))).unwrap_or_default();
                 Error::Unavailable(format!("{server}: {message}{hint}"))
             }
             // Sound, and more than this server ever takes: neither the usage nor a line of the input is wrong.
@@ -158,6 +160,20 @@ impl Error {
 /// The reason that a status carries for programs.
 pub(super) fn reason(status: &Status) -> Option<String> {
     Some(status.get_details_error_info()?.reason)
+}
+
+fn retry_delay(status: &Status) -> Option<Duration> {
+    status.get_details_retry_info()?.retry_delay
+}
+
+/// Seconds as they are told, rounded up.
+fn tenths(delay: Duration) -> f64 {
+    (delay.as_secs_f64() * 10.0).ceil() / 10.0
+}
+
+/// After what time a call passes that was refused because of a rate; nothing of it was carried out.
+pub(super) fn rate_limit_wait(status: &Status) -> Option<Duration> {
+    retry_delay(status).filter(|_| reason(status).as_deref() == Some("RATE_LIMITED"))
 }
 
 /// Whether what was sent is more by itself than the server has room for.
@@ -285,9 +301,12 @@ impl From<Error> for Failure {
 
 #[cfg(test)]
 mod tests {
+    use tonic_types::ErrorDetails;
+
     use super::*;
     use crate::domain::job::JobName;
     use crate::rpc::status;
+    use crate::telemetry::metrics::RateBound;
 
     #[test]
     fn violations_come_back_with_field_and_index() {
@@ -322,6 +341,21 @@ mod tests {
         assert_eq!(last.to_string(), "refused; before that: draining");
         assert_eq!(unavailable("refused").begun_with(&unavailable("refused")).to_string(), "refused");
         assert_eq!(Error::Cancelled.begun_with(&unavailable("draining")), Error::Cancelled);
+    }
+
+    #[test]
+    fn when_to_try_again_is_told_once_and_rounded() {
+        let told = |status: &Status| Error::from_status("http://a", status, true).to_string();
+        let wait = Duration::from_nanos(146_655_954);
+        let limited = status::rate_limited(RateBound::Calls, wait);
+        assert_eq!(rate_limit_wait(&limited), Some(wait));
+        let words = told(&limited);
+        assert!(words.ends_with("; come back in 0.147 s") && !words.contains("try again"), "{words}");
+        let details = ErrorDetails::with_retry_info(Some(Duration::from_millis(1_234)));
+        let full = Status::with_error_details(Code::ResourceExhausted, "full", details);
+        assert_eq!((told(&full).as_str(), rate_limit_wait(&full)), ("http://a: full; try again in 1.3 s", None));
+        let memory = status::memory_full(1);
+        assert!(rate_limit_wait(&memory).is_none() && retry_delay(&memory).is_some());
     }
 
     #[test]

@@ -81,8 +81,9 @@ impl Client {
     /// # Errors
     /// See [`Error`].
     pub async fn get(&mut self, name: &JobName) -> Result<Job, Error> {
-        let answer = self.jobs.get_job(proto::GetJobRequest { name: name.to_string() }).await;
-        Ok(convert::job::from_wire(answer.map_err(|status| self.error(status))?.into_inner())?)
+        let request = proto::GetJobRequest { name: name.to_string() };
+        let job = self.call(request, |mut client, request| async move { client.jobs.get_job(request).await });
+        Ok(convert::job::from_wire(job.await?)?)
     }
 
     /// One page of the jobs that `filter` lets through, the newest first.
@@ -97,7 +98,8 @@ impl Client {
             filter: filter.to_owned(),
             order_by: String::new(),
         };
-        let page = self.jobs.list_jobs(request).await.map_err(|status| self.error(status))?.into_inner();
+        let page =
+            self.call(request, |mut client, request| async move { client.jobs.list_jobs(request).await }).await?;
         let jobs = page.jobs.into_iter().map(convert::job::from_wire).collect::<Result<_, _>>()?;
         Ok(Page { jobs, next_page_token: page.next_page_token })
     }
@@ -106,8 +108,8 @@ impl Client {
     /// See [`Error`].
     pub async fn cancel(&mut self, name: &JobName) -> Result<Job, Error> {
         let request = proto::CancelJobRequest { name: name.to_string(), etag: String::new() };
-        let answer = self.jobs.cancel_job(request).await;
-        Ok(convert::job::from_wire(answer.map_err(|status| self.error(status))?.into_inner())?)
+        let job = self.call(request, |mut client, request| async move { client.jobs.cancel_job(request).await });
+        Ok(convert::job::from_wire(job.await?)?)
     }
 
     /// Puts a job that ended without a result into the queue again.
@@ -116,8 +118,8 @@ impl Client {
     /// See [`Error`]; [`Error::Refused`] for one that has succeeded.
     pub async fn retry(&mut self, name: &JobName) -> Result<Job, Error> {
         let request = proto::RetryJobRequest { name: name.to_string(), etag: String::new() };
-        let answer = self.jobs.retry_job(request).await;
-        Ok(convert::job::from_wire(answer.map_err(|status| self.error(status))?.into_inner())?)
+        let job = self.call(request, |mut client, request| async move { client.jobs.retry_job(request).await });
+        Ok(convert::job::from_wire(job.await?)?)
     }
 
     /// Changes the priority of a job that waits.
@@ -127,8 +129,8 @@ impl Client {
     pub async fn set_priority(&mut self, name: &JobName, priority: i32) -> Result<Job, Error> {
         let request =
             proto::SetJobPriorityRequest { name: name.to_string(), priority: Some(priority), etag: String::new() };
-        let answer = self.jobs.set_job_priority(request).await;
-        Ok(convert::job::from_wire(answer.map_err(|status| self.error(status))?.into_inner())?)
+        let job = self.call(request, |mut client, request| async move { client.jobs.set_job_priority(request).await });
+        Ok(convert::job::from_wire(job.await?)?)
     }
 
     /// Removes a job that has ended.
@@ -137,7 +139,7 @@ impl Client {
     /// See [`Error`]; [`Error::Refused`] for one that has not ended.
     pub async fn delete(&mut self, name: &JobName) -> Result<(), Error> {
         let request = proto::DeleteJobRequest { name: name.to_string(), etag: String::new() };
-        self.jobs.delete_job(request).await.map(|_| ()).map_err(|status| self.error(status))
+        self.call(request, |mut client, request| async move { client.jobs.delete_job(request).await }).await
     }
 
     /// Tells a job's events after a sequence number until its end, over broken connections and restarts of the server.

@@ -1,7 +1,8 @@
 //! The client side of the API: what every command that talks to a server shares.
 //!
 //! Calls that may be repeated are repeated when the connection breaks, for a bounded time: a watch goes on after its
-//! last event, a result after its last byte, a creation under its request id.
+//! last event, a result after its last byte, a creation under its request id. Every call is repeated where a rate refused
+//! it, after the time that the server tells.
 //!
 //! Here is the connection; its calls are in files of their own.
 
@@ -18,14 +19,15 @@ mod solve;
 pub mod upload;
 mod uploaded_inputs;
 
+use std::future::Future;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::Duration;
 
-use tonic::Status;
 use tonic::codec::CompressionEncoding::Gzip;
 use tonic::service::interceptor::InterceptedService;
 use tonic::transport::{Channel, Endpoint};
+use tonic::{Response, Status};
 
 pub use error::Error;
 pub use jobs::{JobOptions, Page, ended, ended_as};
@@ -45,6 +47,10 @@ const CONNECT_TIMEOUT: Duration = Duration::from_secs(5);
 
 /// A silent connection is asked this often whether it lives, so that a watch of a long job notices a lost server.
 const KEEPALIVE: Duration = Duration::from_secs(20);
+
+/// A rate that lets the call pass sooner than this is waited for without a word: a list of many pages may meet it at
+/// every page.
+const SILENT_WAIT: Duration = Duration::from_secs(1);
 
 /// Largest answer that is taken: interim weights of the most tracks that any server allows are below it.
 const MAX_MESSAGE_BYTES: usize = 64 << 20;
@@ -131,22 +137,39 @@ impl Client {
         if self.is_tenant_given { own_words } else { own_words.or_no_tenant(&status) }
     }
 
+    /// Makes a call, and makes it again where a rate of calls or jobs refused it. For any other trouble it does not wait.
+    async fn call<R: Clone, T, F>(&self, request: R, send: impl Fn(Self, R) -> F) -> Result<T, Error>
+    where
+        F: Future<Output = Result<Response<T>, Status>>,
+    {
+        let mut backoff = Backoff::default();
+        loop {
+            match backoff.within(send(self.clone(), request.clone())).await {
+                Ok(answer) => return Ok(answer.into_inner()),
+                Err(status) if error::rate_limit_wait(&status).is_some() => self.pause(&mut backoff, status).await?,
+                Err(status) => return Err(self.error(status)),
+            }
+        }
+    }
+
     /// Waits before another try, or gives up: for good reason, or after too many. Says so once each trouble, on stderr:
     /// half a minute of silence looks like a hang.
     async fn pause(&self, backoff: &mut Backoff, status: Status) -> Result<(), Error> {
-        let transient = error::is_transient(&status);
+        let wait = error::rate_limit_wait(&status);
+        let transient = wait.is_some() || error::is_transient(&status);
         let first = transient && backoff.failed(&status);
-        if first {
+        if first && wait.is_none_or(|wait| (SILENT_WAIT..Backoff::TOTAL).contains(&wait)) {
             // Whether it is the right server can be asked once it has gone on for so long: one that is ended breaks
             // connections in the same way.
             let trouble = Error::from_status(&self.server, &status, true);
             tell!("waiting up to {} s: {trouble}", Backoff::TOTAL.as_secs());
         }
         let error = self.error(status);
-        if transient && backoff.pause().await {
+        if transient && backoff.pause(wait.unwrap_or_default()).await {
             return Ok(());
         }
-        let before = backoff.first().map(|status| self.error(status.clone()));
+        // A rate says the same at every try, with another time.
+        let before = backoff.first().filter(|_| wait.is_none()).map(|status| self.error(status.clone()));
         Err(before.map_or(error.clone(), |before| error.begun_with(&before)))
     }
 

@@ -24,7 +24,8 @@ impl Client {
             page_size: page_size.into(),
             page_token: page_token.to_owned(),
         };
-        let page = self.inputs.list_inputs(request).await.map_err(|status| self.error(status))?.into_inner();
+        let page = self.call(request, |mut client, request| async move { client.inputs.list_inputs(request).await });
+        let page = page.await?;
         Ok(InputPage { inputs: page.inputs, next_page_token: page.next_page_token })
     }
 
@@ -34,6 +35,6 @@ impl Client {
     /// See [`Error`].
     pub async fn delete_input(&mut self, name: &InputName) -> Result<(), Error> {
         let request = proto::DeleteInputRequest { name: name.to_string() };
-        self.inputs.delete_input(request).await.map(|_| ()).map_err(|status| self.error(status))
+        self.call(request, |mut client, request| async move { client.inputs.delete_input(request).await }).await
     }
 }
