@@ -76,7 +76,7 @@ impl Inner {
         }
         let retried = self.store.retry_job(name, etag, &self.options.queue, self.now()).await;
         if let Err(store::Error::QueueFull(bound)) = &retried {
-            observe::refused(observe::Refusal::QueueFull(bound.quota()));
+            observe::refused(observe::Refusal::QueueFull(bound.quota));
         }
         let reply = retried?;
         if reply.queued_now {

@@ -84,7 +84,7 @@ impl From<store::Error> for Error {
             store::Error::PageToken => Error::InvalidArgument(Violation::of("page_token", error.to_string()).into()),
             store::Error::QueueFull(bound) => Error::QueueFull {
                 retry_after: super::Options::DEFAULT_RETRY_AFTER,
-                bound: bound.quota().name(),
+                bound: bound.quota.name(),
                 message: bound.to_string(),
             },
             store::Error::Unavailable(cause) => Error::Unavailable(cause),

@@ -227,9 +227,9 @@ impl Inner {
                 Ok(created.into_iter().map(|created| self.dated(created.job)).collect())
             }
             Err(store::Error::QueueFull(bound)) => {
-                observe::refused(observe::Refusal::QueueFull(bound.quota()));
+                observe::refused(observe::Refusal::QueueFull(bound.quota));
                 let retry_after = self.options.retry_after;
-                Err(Error::QueueFull { retry_after, bound: bound.quota().name(), message: bound.to_string() })
+                Err(Error::QueueFull { retry_after, bound: bound.quota.name(), message: bound.to_string() })
             }
             Err(store::Error::BatchTooLarge(oversize)) => {
                 observe::refused(observe::Refusal::BatchTooLarge(oversize.quota));

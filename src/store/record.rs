@@ -132,10 +132,11 @@ impl QueueBounds {
 
     fn refuses_tenant(&self, stats: &QueueStats, bytes: u64) -> Option<Bound> {
         if stats.queued >= self.max_tenant_jobs {
-            Some(Bound::TenantJobs { waiting: stats.queued, max: self.max_tenant_jobs })
+            Some(Bound { quota: Quota::TenantJobs, waiting: stats.queued, asked: 1, max: self.max_tenant_jobs })
         } else if stats.queued > 0 && stats.queued_bytes.saturating_add(bytes) > self.max_tenant_bytes {
             // As below: a tenant's job that waits alone always fits.
-            Some(Bound::TenantBytes { waiting: stats.queued_bytes, max: self.max_tenant_bytes })
+            let (waiting, max) = (stats.queued_bytes, self.max_tenant_bytes);
+            Some(Bound { quota: Quota::TenantBytes, waiting, asked: bytes, max })
         } else {
             None
         }
@@ -143,62 +144,66 @@ impl QueueBounds {
 
     fn refuses_all(&self, stats: &QueueStats, bytes: u64, observations: u64) -> Option<Bound> {
         if stats.queued >= self.max_jobs {
-            return Some(Bound::Jobs { waiting: stats.queued, max: self.max_jobs });
+            return Some(Bound { quota: Quota::Jobs, waiting: stats.queued, asked: 1, max: self.max_jobs });
         }
         // A job alone in the queue always fits: what is too large for an empty queue is refused by the limits on
         // inputs.
         if stats.queued == 0 {
             None
         } else if stats.queued_bytes.saturating_add(bytes) > self.max_bytes {
-            Some(Bound::Bytes { waiting: stats.queued_bytes, max: self.max_bytes })
+            Some(Bound { quota: Quota::Bytes, waiting: stats.queued_bytes, asked: bytes, max: self.max_bytes })
         } else if stats.queued_observations.saturating_add(observations) > self.max_observations {
-            Some(Bound::Observations { waiting: stats.queued_observations, max: self.max_observations })
+            let (waiting, max) = (stats.queued_observations, self.max_observations);
+            Some(Bound { quota: Quota::Observations, waiting, asked: observations, max })
         } else {
             None
         }
     }
 }
 
-/// The bound of the queue that refused a job.
+/// The bound of the queue that refused a job, or a batch.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum Bound {
-    Jobs { waiting: u64, max: u64 },
-    Bytes { waiting: u64, max: u64 },
-    Observations { waiting: u64, max: u64 },
-    TenantJobs { waiting: u64, max: u64 },
-    TenantBytes { waiting: u64, max: u64 },
+pub struct Bound {
+    pub quota: Quota,
+    /// How much of it waits, without what was refused.
+    pub waiting: u64,
+    /// How much the call asked for.
+    pub asked: u64,
+    pub max: u64,
 }
 
 impl Bound {
-    /// What there is too much of.
-    pub fn quota(self) -> Quota {
-        match self {
-            Bound::Jobs { .. } => Quota::Jobs,
-            Bound::Bytes { .. } => Quota::Bytes,
-            Bound::Observations { .. } => Quota::Observations,
-            Bound::TenantJobs { .. } => Quota::TenantJobs,
-            Bound::TenantBytes { .. } => Quota::TenantBytes,
-        }
+    /// The same of a batch: `stored` are those of its jobs that were stored and count as waiting, and `rest` begins with
+    /// the job that was refused.
+    pub fn of_batch(self, stored: &[&NewRecord], rest: &[NewRecord]) -> Self {
+        let of_tenant = matches!(self.quota, Quota::TenantJobs | Quota::TenantBytes);
+        let tenant = rest.first().filter(|_| of_tenant).map(|refused| refused.name.tenant.as_str());
+        let amount = |news: &mut dyn Iterator<Item = &NewRecord>| {
+            let mut stats = QueueStats::default();
+            news.filter(|new| tenant.is_none_or(|tenant| new.name.tenant == tenant)).for_each(|new| stats.add(new));
+            match self.quota {
+                Quota::Bytes | Quota::TenantBytes => stats.queued_bytes,
+                Quota::Observations => stats.queued_observations,
+                _ => stats.queued,
+            }
+        };
+        let before = amount(&mut stored.iter().copied());
+        let asked = before.saturating_add(amount(&mut rest.iter()));
+        Self { waiting: self.waiting.saturating_sub(before), asked, ..self }
     }
 }
 
 impl fmt::Display for Bound {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        match self {
-            Bound::Jobs { waiting, max } => write!(f, "the queue is full: {waiting} of at most {max} jobs wait"),
-            Bound::Bytes { waiting, max } => {
-                write!(f, "the queue is full: {waiting} of at most {max} bytes of input wait")
-            }
-            Bound::Observations { waiting, max } => {
-                write!(f, "the queue is full: {waiting} of at most {max} observations wait")
-            }
-            Bound::TenantJobs { waiting, max } => {
-                write!(f, "the tenant's share of the queue is full: {waiting} of at most {max} jobs wait")
-            }
-            Bound::TenantBytes { waiting, max } => {
-                write!(f, "the tenant's share of the queue is full: {waiting} of at most {max} bytes of input wait")
-            }
-        }
+        let Self { quota, waiting, asked, max } = self;
+        let (full, what) = match quota {
+            Quota::TenantJobs => ("the tenant's share of the queue", "jobs"),
+            Quota::TenantBytes => ("the tenant's share of the queue", "bytes of input"),
+            Quota::Bytes => ("the queue", "bytes of input"),
+            Quota::Observations => ("the queue", "observations"),
+            _ => ("the queue", "jobs"),
+        };
+        write!(f, "{full} is full: {what} waiting: {waiting}, asked for: {asked}, allowed: {max}")
     }
 }
 

@@ -16,7 +16,7 @@ async fn a_full_queue_refuses_at_once_and_takes_on_again() {
     match test.engine.submit(new_job(Behavior::Wait)).await {
         Err(Error::QueueFull { retry_after, bound, message }) => {
             assert_eq!((retry_after, bound), (Duration::from_secs(17), "jobs"));
-            assert_eq!(message, "the queue is full: 1 of at most 1 jobs wait");
+            assert_eq!(message, "the queue is full: jobs waiting: 1, asked for: 1, allowed: 1");
         }
         other => panic!("{other:?}"),
     }

@@ -31,7 +31,8 @@ pub(super) async fn create<C: Connection>(
         uploads::lock(connection, &news.iter().filter_map(uploaded).collect()).await?;
         for (new, input) in news.iter().zip(&mut inputs) {
             // Payloads take long: nobody else's admission waits for them.
-            if admit(connection, new, bounds, &mut stats).await?.is_none() {
+            let admitted = admit(connection, new, bounds, &mut stats).await;
+            if admitted.map_err(|error| of_batch(error, &[], news))?.is_none() {
                 *input = Some(input_of(connection, new, now).await?);
             }
         }
@@ -39,9 +40,10 @@ pub(super) async fn create<C: Connection>(
         // Looked over again below: others may have come in between.
         stats = AdmissionStats::default();
     }
-    let mut created = Vec::new();
-    for (new, input) in news.iter().zip(inputs) {
-        match admit(connection, new, bounds, &mut stats).await? {
+    let (mut created, mut stored) = (Vec::new(), Vec::new());
+    for (place, (new, input)) in news.iter().zip(inputs).enumerate() {
+        let admitted = admit(connection, new, bounds, &mut stats).await;
+        match admitted.map_err(|error| of_batch(error, &stored, &news[place..]))? {
             Some(job) => {
                 if let Some(input) = input {
                     let delete = Statement::new("DELETE FROM inputs WHERE id = $1 AND input IS NULL");
@@ -56,6 +58,7 @@ pub(super) async fn create<C: Connection>(
                 };
                 created.push(Created { job: enqueue(connection, new, input, now).await?, new: true });
                 stats.add(new);
+                stored.push(new);
             }
         }
     }
@@ -64,6 +67,14 @@ pub(super) async fn create<C: Connection>(
         fairness::register(connection, tenant).await?;
     }
     Ok(created)
+}
+
+/// Counts the whole batch where one of its jobs was refused; see [`crate::store::record::Bound::of_batch`].
+fn of_batch(error: Error, stored: &[&NewRecord], rest: &[NewRecord]) -> Error {
+    match error {
+        Error::QueueFull(bound) => Error::QueueFull(bound.of_batch(stored, rest)),
+        other => other,
+    }
 }
 
 /// Refuses jobs that are more by themselves than may ever wait: told to come back, their caller would do so for ever.
