@@ -51,14 +51,11 @@ impl SpaceFlag {
 }
 
 impl Ballast {
-    /// The one of this directory, made where there is none.
+    /// The one of this directory. Where there is none, [`restore`](Self::restore) makes it.
     pub(super) fn of(directory: &Path) -> Self {
         let path = directory.join(BALLAST_FILE);
         let is_whole = std::fs::metadata(&path).is_ok_and(|file| file.len() == BALLAST_BYTES);
-        let mut ballast =
-            Self { path, is_whole, tried: None, given_up: None, has_room: SpaceFlag(Arc::new(AtomicBool::new(true))) };
-        ballast.restore();
-        ballast
+        Self { path, is_whole, tried: None, given_up: None, has_room: SpaceFlag(Arc::new(AtomicBool::new(true))) }
     }
 
     pub(super) fn space_flag(&self) -> SpaceFlag {
@@ -172,7 +169,9 @@ mod tests {
     fn what_was_given_up_is_made_again_once_there_is_room() {
         let directory = tempfile::tempdir().expect("a temporary directory");
         let mut ballast = Ballast::of(directory.path());
-        assert!(ballast.is_whole() && length(&ballast) == Some(BALLAST_BYTES));
+        assert!(ballast.is_due() && length(&ballast).is_none(), "nothing is made before it is asked for");
+        assert!(ballast.restore() && ballast.is_whole() && length(&ballast) == Some(BALLAST_BYTES));
+        assert!(Ballast::of(directory.path()).is_whole(), "it is found again");
         assert!(ballast.give_up() && !ballast.is_whole() && length(&ballast).is_none());
         assert!(!ballast.give_up(), "it was given already");
         // Where its draft should stand is no room.
@@ -197,7 +196,7 @@ mod tests {
     fn one_that_was_cut_off_is_made_whole() {
         let directory = tempfile::tempdir().expect("a temporary directory");
         std::fs::write(directory.path().join(BALLAST_FILE), [1; 1_000]).expect("written");
-        let ballast = Ballast::of(directory.path());
-        assert!(ballast.is_whole() && length(&ballast) == Some(BALLAST_BYTES));
+        let mut ballast = Ballast::of(directory.path());
+        assert!(ballast.restore() && ballast.is_whole() && length(&ballast) == Some(BALLAST_BYTES));
     }
 }

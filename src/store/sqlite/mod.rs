@@ -106,6 +106,11 @@ impl Sqlite {
             }
             opened => opened?,
         };
+        // Only now: in the directory of another program nothing is made but the lock's file, which keeps two servers
+        // from looking at once.
+        if ballast.is_due() {
+            ballast.restore();
+        }
         let has_room = ballast.space_flag();
         let files = [database.clone(), log_of(&database)];
         let writer = Writer::start(connection, database, ballast, group_time)?;
@@ -143,22 +148,28 @@ async fn migrate(options: &SqliteConnectOptions) -> Result<(), Error> {
 async fn bring_up_to_date(options: &SqliteConnectOptions, database: &Path) -> Result<WriteConnection, Error> {
     // First, and there until the other one is closed, also by an error: the last one to go writes the log back, which a
     // full disk has no room for.
-    let mut connection = WriteConnection::open(database)?;
-    refuse_foreign(&mut connection)?;
+    let connection = open_own(database)?;
     migrate(options).await?;
     Ok(connection)
 }
 
-/// Refuses a database of another program before anything is written to it.
-fn refuse_foreign(connection: &mut WriteConnection) -> Result<(), Error> {
-    let own = connection.first_row(OWN_TABLES, |row| row.get::<_, i64>(0))?;
-    if own == 2 {
-        return Ok(());
+/// Opens a store's database; refuses any other file before anything is written to it.
+fn open_own(database: &Path) -> Result<WriteConnection, Error> {
+    let opened = WriteConnection::open(database).and_then(|mut connection| {
+        let own = connection.first_row(OWN_TABLES, |row| row.get::<_, i64>(0))?;
+        Ok((connection, own == 2))
+    });
+    let file = database.display();
+    match opened {
+        Ok((connection, true)) => Ok(connection),
+        Ok((_, false)) => Err(Error::Corrupt(format!(
+            "{file} is the database of another program; give another data directory (store.data_dir)"
+        ))),
+        Err(Error::Corrupt(what)) => Err(Error::Corrupt(format!(
+            "{file}: {what}; restore it from a backup, or give another data directory (store.data_dir)"
+        ))),
+        Err(error) => Err(error),
     }
-    Err(Error::Corrupt(format!(
-        "{} is the database of another program; give another data directory (store.data_dir)",
-        connection.database().display()
-    )))
 }
 
 /// The write-ahead log of a database.

@@ -137,8 +137,31 @@ async fn a_database_of_another_program_is_refused_and_left_as_it_is() {
         let error = Sqlite::open(directory.path()).await.expect_err("is foreign");
         assert!(matches!(&error, Error::Corrupt(told) if told.contains("of another program")), "{error}");
         assert_eq!(std::fs::read(&database).expect("is there"), before);
-        assert!(!directory.path().join(format!("{DATABASE_FILE}-wal")).exists());
+        assert_eq!(files(directory.path()), [DATABASE_FILE, LOCK_FILE]);
     }
+}
+
+/// Names of the files in a directory, sorted.
+fn files(directory: &Path) -> Vec<String> {
+    let entries = std::fs::read_dir(directory).expect("a directory");
+    let name = |entry: std::io::Result<std::fs::DirEntry>| entry.expect("a file").file_name().into_string();
+    let mut names: Vec<String> = entries.map(|entry| name(entry).expect("UTF-8")).collect();
+    names.sort();
+    names
+}
+
+#[tokio::test]
+async fn a_file_that_is_no_database_is_refused_by_its_name_and_left_as_it_is() {
+    let directory = tempfile::tempdir().expect("a temporary directory");
+    let database = directory.path().join(DATABASE_FILE);
+    let text = "No database, and longer than the header of one. ".repeat(100);
+    std::fs::write(&database, &text).expect("written");
+    let error = Sqlite::open(directory.path()).await.expect_err("no database");
+    let path = database.display().to_string();
+    let says = |told: &str| told.starts_with(&path) && told.contains("not a database") && told.contains("data_dir");
+    assert!(matches!(&error, Error::Corrupt(told) if says(told)), "{error}");
+    assert_eq!(std::fs::read_to_string(&database).expect("is there"), text);
+    assert_eq!(files(directory.path()), [DATABASE_FILE, LOCK_FILE]);
 }
 
 #[tokio::test]
