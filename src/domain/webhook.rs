@@ -85,8 +85,14 @@ impl Webhook {
         if url.fragment().is_some() {
             return Err("has a fragment (#...), which is never sent".into());
         }
+        if url.port() == Some(0) {
+            return Err("has the port 0, to which nothing can be sent".into());
+        }
+        // The parser skips slashes: of `http:///x` it makes the host `x`.
+        let after_scheme = text.split_once("://").map_or("", |(_, rest)| rest);
         match url.host_str() {
             None | Some("") => Err("has no host".into()),
+            Some(_) if after_scheme.starts_with(['/', '\\']) || after_scheme.is_empty() => Err("has no host".into()),
             Some(_) => Ok(url),
         }
     }
@@ -109,6 +115,12 @@ mod tests {
             ("/a", "is not a URL"),
             ("https://", "is not a URL"),
             ("https://a:99999/", "is not a URL"),
+            ("https://a:0/", "port 0"),
+            ("http:///x", "no host"),
+            ("http:////x/y", "no host"),
+            ("http:/x", "no host"),
+            ("http:x", "no host"),
+            ("http://\\x", "no host"),
             ("ftp://a/b", "scheme"),
             ("file:///etc/passwd", "scheme"),
             ("https://user@a/", "user name"),
