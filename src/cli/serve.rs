@@ -10,7 +10,7 @@ use super::exit::{Exit, Failure};
 use super::interrupt::Signals;
 use super::service::Service;
 use super::{print, prior_file};
-use crate::config::Config;
+use crate::config::{Config, Endpoint};
 use crate::engine::StoreState;
 use crate::telemetry;
 
@@ -195,7 +195,7 @@ pub async fn run(args: Args) -> Result<Exit, Failure> {
         format: config.log.format,
         filter: &config.log.filter,
         access: config.log.access,
-        otlp_endpoint: config.otlp.endpoint.as_deref(),
+        otlp_endpoint: config.otlp.endpoint.as_ref().map(Endpoint::reveal),
         service_name: "scpsfm",
     })
     .map_err(Failure::bad_config)?;

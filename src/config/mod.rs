@@ -3,6 +3,7 @@
 //! Every key may stand in a TOML file (`[engine] workers = 4`), in the environment (`SCPSFM_ENGINE__WORKERS=4`) or,
 //! for some, in a flag. An unknown key is an error: a misspelt limit must not silently be no limit.
 
+mod endpoint;
 mod exposure;
 mod file;
 mod retention;
@@ -15,6 +16,7 @@ use serde::{Deserialize, Serialize};
 
 use crate::domain::Limits;
 use crate::store::postgres::DatabaseUrl;
+pub use endpoint::Endpoint;
 pub use retention::Retention;
 pub use sections::{Auth, Compute, Engine, Http, Log, Metrics, Otlp, Rates, Server, Store, Tls, Upload, Webhooks};
 pub use weights::TenantWeights;
@@ -124,7 +126,7 @@ impl Config {
     }
 
     /// The configuration as a TOML file that would give it, but for its secrets: of each that is left out a comment
-    /// says so, and a file whose store's password is missing is refused rather than misunderstood.
+    /// says so, and a file in which a password is missing is refused rather than misunderstood.
     ///
     /// # Errors
     /// When a value has no form in TOML, such as a path that is not Unicode.
@@ -134,6 +136,12 @@ impl Config {
             text.push_str(
                 "# The password in store.url is not shown, and this file is refused without it: put it in the place of ***,\n\
                  # or the whole address into SCPSFM_STORE__URL, which wins over the file.\n\n",
+            );
+        }
+        if self.otlp.endpoint.as_ref().is_some_and(Endpoint::has_password) {
+            text.push_str(
+                "# The password in otlp.endpoint is not shown, and this file is refused without it: put it in the place of\n\
+                 # ***, or the whole address into SCPSFM_OTLP__ENDPOINT, which wins over the file.\n\n",
             );
         }
         if self.auth.keys.is_some() {
@@ -178,7 +186,11 @@ impl Config {
         at_least_one("upload.max_bytes", self.upload.max_bytes)?;
         at_least_one("upload.tenant_uploads", self.upload.tenant_uploads)?;
         at_least_one("upload.tenant_bytes", self.upload.tenant_bytes)?;
-        at_least_one("rates.calls_burst", u64::from(self.rates.calls_burst))?;
+        if self.rates.calls_burst < Rates::LEAST_CALLS_BURST {
+            let found = self.rates.calls_burst.to_string();
+            let right = "a number from 2 on (an upload over HTTP is two calls)";
+            return Err(Error::Value { key: "rates.calls_burst", found, right });
+        }
         if self.rates.jobs_burst < Rates::LEAST_JOBS_BURST {
             let found = self.rates.jobs_burst.to_string();
             return Err(Error::Value { key: "rates.jobs_burst", found, right: "a number from 1000 on (a batch)" });
@@ -211,13 +223,6 @@ impl Config {
                 right: "levels by module, such as `info` or `info,scpsfm::engine=debug`",
             });
         }
-        if let Some(endpoint) = self.otlp.endpoint.as_ref().filter(|endpoint| !is_collector(endpoint)) {
-            return Err(Error::Value {
-                key: "otlp.endpoint",
-                found: format!("`{endpoint}`"),
-                right: "a collector's http:// or https:// address, such as http://127.0.0.1:4317",
-            });
-        }
         self.http.validate()?;
         self.tls.validate()?;
         Ok(exposure::check(&self.server, &self.http, &self.tls, &self.auth)?)
@@ -241,11 +246,6 @@ fn keys_among(variables: Vec<(String, String)>) -> Result<Vec<(String, String)>,
         }
     }
     Ok(keys)
-}
-
-fn is_collector(endpoint: &str) -> bool {
-    let uri: Result<axum::http::Uri, _> = endpoint.parse();
-    uri.is_ok_and(|uri| matches!(uri.scheme_str(), Some("http" | "https")) && uri.host().is_some())
 }
 
 #[cfg(test)]

@@ -9,7 +9,7 @@ use serde::de::IntoDeserializer;
 use serde::{Deserialize, Deserializer, Serialize, Serializer};
 
 use super::weights::TenantWeights;
-use super::{Error, Retention};
+use super::{Endpoint, Error, Retention};
 use crate::domain::Backend;
 use crate::engine::WebhookSecrets;
 use crate::parallel::Threads;
@@ -199,7 +199,7 @@ impl Auth {
 pub struct Rates {
     /// Calls a second of a key; without keys of all callers together. 0: any. Health checks do not count.
     pub calls_per_second: u32,
-    /// Calls at once after a pause.
+    /// Calls at once after a pause; at least [`Rates::LEAST_CALLS_BURST`].
     pub calls_burst: u32,
     /// Jobs a second that a tenant creates; a batch counts its jobs. 0: any.
     pub jobs_per_second: u32,
@@ -208,6 +208,9 @@ pub struct Rates {
 }
 
 impl Rates {
+    /// Least that [`Rates::calls_burst`] may be: an upload over HTTP is two calls, and would never pass.
+    pub const LEAST_CALLS_BURST: u32 = 2;
+
     /// Least that [`Rates::jobs_burst`] may be: a batch is taken whole, or would never be.
     pub const LEAST_JOBS_BURST: u32 = rpc::jobs::MAX_BATCH as u32;
 
@@ -422,9 +425,9 @@ impl Default for Log {
 #[serde(default, deny_unknown_fields)]
 pub struct Otlp {
     /// Collector (gRPC), e.g. `http://127.0.0.1:4317`, or `https://`, trusted by the system's authorities. None by
-    /// default: a server sends nothing anywhere unasked.
+    /// default: a server sends nothing anywhere unasked. Wherever the configuration is shown, a password in it is not.
     #[serde(skip_serializing_if = "Option::is_none")]
-    pub endpoint: Option<String>,
+    pub endpoint: Option<Endpoint>,
 }
 
 /// Delivery of the ends of jobs to the URLs that they name. Off without a secret.

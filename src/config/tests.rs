@@ -2,7 +2,7 @@
 
 use std::io::Write;
 
-use super::{Config, Error, Server};
+use super::{Config, Endpoint, Error, Server};
 use crate::domain::Backend;
 use crate::telemetry::tracing::Format;
 
@@ -95,6 +95,30 @@ fn the_password_of_the_store_is_shown_nowhere() {
 }
 
 #[test]
+fn the_password_of_the_collector_is_shown_nowhere() {
+    let load = |given: &str| Config::from_sources(None, variables(&[("SCPSFM_OTLP__ENDPOINT", given)]), &[]);
+    let given = "http://me:hunter2@collector:4317/v1";
+    let config = load(given).expect("valid");
+    assert_eq!(config.otlp.endpoint.as_ref().map(Endpoint::reveal), Some(given));
+    let printed = config.to_toml().expect("TOML");
+    for shown in [&format!("{config:?}"), &printed] {
+        assert!(shown.contains("http://me:***@collector:4317/v1") && !shown.contains("hunter2"), "{shown}");
+    }
+    assert!(printed.starts_with("# The password in otlp.endpoint is not shown"), "{printed}");
+    let printed = file(&printed);
+    let again = Config::from_sources(Some(printed.path()), variables(&[("SCPSFM_OTLP__ENDPOINT", given)]), &[]);
+    assert_eq!(again.expect("complete"), config);
+    let error = Config::from_sources(Some(printed.path()), vec![], &[]).expect_err("no password").to_string();
+    assert!(error.contains("otlp.endpoint") && error.contains("SCPSFM_OTLP__ENDPOINT"), "{error}");
+    for wrong in ["ftp://me:hunter2@collector", "me:hunter2@collector:4317", "http://me:hunter2 @collector"] {
+        let error = load(wrong).expect_err(wrong).to_string();
+        assert!(error.contains("otlp.endpoint") && !error.contains("hunter2"), "{error}");
+    }
+    let bare = load("http://me@collector:4317").expect("valid").to_toml().expect("TOML");
+    assert!(bare.contains("http://me@collector:4317") && !bare.contains("not shown"), "{bare}");
+}
+
+#[test]
 fn keys_are_kept_as_hashes_and_shown_nowhere() {
     let key = "0123456789abcdef0123456789abcdef";
     let given = format!("north:{key}");
@@ -156,7 +180,7 @@ fn errors_name_the_key_and_what_would_be_right() {
         ),
         (from_variable("SCPSFM_ENGINE_WORKERS", "4"), &["SCPSFM_ENGINE_WORKERS", "SCPSFM_ENGINE__WORKERS"]),
         (from_variable("SCPSFM_OTLP__ENDPOINT", "x:4317"), &["otlp.endpoint", "http://127.0.0.1:4317"]),
-        (from_file("[rates]\ncalls_burst = 0\n"), &["rates.calls_burst", "from 1 on"]),
+        (from_file("[rates]\ncalls_burst = 1\n"), &["rates.calls_burst", "from 2 on", "upload"]),
         (from_file("[rates]\njobs_burst = 999\n"), &["rates.jobs_burst", "from 1000 on"]),
         (from_variable("SCPSFM_RATES_CALLS_PER_SECOND", "4"), &["SCPSFM_RATES__CALLS_PER_SECOND"]),
         (from_variable("SCPSFM_AUTH__KEYS", "north:hunter2"), &["auth.keys", "entry 1", "32"]),
@@ -213,6 +237,7 @@ fn bounds_are_refused_by_key_and_what_is_within_them_is_taken() {
         assert!(error.contains(key) && error.contains("365250d") && error.contains("`forever`"), "{error}");
         assert!(given(name, "365250d").is_ok() && given(name, "forever").is_ok(), "{key}");
     }
+    assert!(given("SCPSFM_RATES__CALLS_BURST", "2").is_ok());
     let least = Server::LEAST_MESSAGE_BYTES;
     for small in ["0", "1", &(least - 1).to_string()] {
         let error = given("SCPSFM_SERVER__MAX_MESSAGE_BYTES", small).expect_err(small).to_string();
