@@ -227,8 +227,15 @@ impl ExportArgs {
         self.export.iter().copied().map(Export::from).collect()
     }
 
-    /// Refuses, before any work, a directory in which the result would replace what it is made from.
-    pub fn check(&self, directory: &Path, input: &Path) -> Result<(), Failure> {
+    /// Refuses, before any work, a directory in which the result would replace what it is made from, and an export that
+    /// no result of an input of this kind has.
+    pub fn check(&self, directory: &Path, input: &Path, format: Option<Format>) -> Result<(), Failure> {
+        if self.export.contains(&ExportArg::ColmapDb) && format != Some(Format::ColmapDatabase) {
+            return Err(Failure::usage(format_args!(
+                "--export colmap-db: {} is no COLMAP database: there is none to copy",
+                input.display()
+            )));
+        }
         match result_files::replaced(directory, &self.exports(), input) {
             Some(place) => Err(Failure::usage(format_args!(
                 "--out {}: the result would replace its own input, {}: give another directory",

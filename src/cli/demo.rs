@@ -63,7 +63,7 @@ pub struct Args {
     #[arg(long)]
     pub json: bool,
 
-    /// Show no progress
+    /// Show no progress and no words
     #[arg(long, short)]
     pub quiet: bool,
 }
@@ -89,10 +89,11 @@ pub async fn run(args: Args) -> Result<Exit, Failure> {
     let input = LabelledInput::unlabelled(scene.input.clone(), Path::new(result_files::OBSERVATIONS));
     result_files::write(&args.out, &solution, Some(&input), &[])?;
     let comparison = Comparison::new(&scene, &solution);
-    print(
-        if args.json { comparison.json(&args, &solution)? } else { comparison.text(&args, &scene, &solution) }
-            .trim_end(),
-    )?;
+    if args.json {
+        print(comparison.json(&args, &solution)?.trim_end())?;
+    } else if !args.quiet {
+        print(comparison.text(&args, &scene, &solution).trim_end())?;
+    }
     if comparison.inliers.f1 < LEAST_F1 {
         let what = format!(
             "the inliers found agree badly with the truth: F1 {:.3} is below {LEAST_F1}",

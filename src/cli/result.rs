@@ -41,7 +41,7 @@ pub struct Args {
     pub export: ExportArgs,
 
     /// Directory for the result files; created, files of these names in it are replaced, and those of a former result
-    /// go
+    /// go. Required without --json
     #[arg(long, value_name = "DIR", required_unless_present = "json")]
     pub out: Option<PathBuf>,
 
@@ -67,8 +67,8 @@ pub async fn run(args: Args) -> Result<Exit, Failure> {
             reading.trim_start()
         )));
     }
-    if let (Some(out), Some(path)) = (&args.out, &args.input) {
-        args.export.check(out, path)?;
+    if let (Some(out), Some(path), Some(input)) = (&args.out, &args.input, &input) {
+        args.export.check(out, path, input.format)?;
     }
     let name = args.name.of(&args.server.access)?;
     let solution = args.server.connect().await?.read_result(&name).await?;

@@ -98,7 +98,7 @@ pub async fn run(args: Args) -> Result<Exit, Failure> {
         tell_notes(&input);
     }
     // Found out now rather than after the work.
-    args.export.check(&args.out, &args.input.input)?;
+    args.export.check(&args.out, &args.input.input, input.format)?;
     create_directory(&args.out)?;
     let threads = args.threads.map_or_else(Threads::one_a_core, |count| Threads::new(count.into()));
     if let Some(length) = args.window.window {

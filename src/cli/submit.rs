@@ -13,6 +13,7 @@ use super::exit::{Exit, Failure};
 use super::{job_view, print};
 use crate::domain::job::JobName;
 use crate::domain::{InputName, Webhook};
+use crate::formats::STANDARD_INPUT;
 use crate::rpc::convert::create::MAX_PRIORITY;
 
 const EXAMPLES: &str = "\
@@ -98,6 +99,9 @@ pub async fn run(args: Args) -> Result<Exit, Failure> {
         if several && given {
             return Err(Failure::usage(format!("{flag} is for one input")));
         }
+    }
+    if args.inputs.iter().filter(|path| path.as_os_str() == STANDARD_INPUT).count() > 1 {
+        return Err(Failure::usage("INPUT: `-` is given twice, and standard input is read once"));
     }
     let labels = labels(args.labels)?;
     let read = args.inputs.iter().map(|path| args.reading.read(path)).collect::<Result<Vec<_>, _>>()?;

@@ -36,4 +36,4 @@ pub use error::Error;
 pub use export::Export;
 pub use input::LabelledInput;
 pub use label::Label;
-pub use source::{Format, Matches, Reading, read};
+pub use source::{Format, Matches, Reading, STANDARD_INPUT, read};

@@ -10,7 +10,7 @@ use super::{colmap, observations, opensfm, text};
 use crate::domain::{FocalPrior, ImageSize, Limits};
 
 /// The path that stands for standard input, as with most programs.
-pub(super) const STANDARD_INPUT: &str = "-";
+pub const STANDARD_INPUT: &str = "-";
 /// How SQLite files, and so COLMAP databases, begin.
 pub(super) const SQLITE_MAGIC: &[u8] = b"SQLite format 3\0";
 /// How OpenSfM's tracks.csv begins, from its version 1 on.

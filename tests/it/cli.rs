@@ -114,10 +114,12 @@ fn wrong_usage_ends_with_2_and_does_nothing() {
     let directory = directory();
     let input = scene(directory.path());
     let (input, out) = (text(&input), directory.path().join("out"));
-    let cases: [&[&str]; 18] = [
+    let cases: [&[&str]; 20] = [
         &["solve", input],
         &["solve", input, "--out", text(&out), "--seed", "-1"],
         &["submit", "--server", NOBODY],
+        &["submit", "-", "-", "--server", NOBODY],
+        &["solve", input, "--out", text(&out), "--export", "colmap-db"],
         &["solve", input, "--out", text(&out), "--width", "100"],
         &["solve", input, "--out", text(&out), "--width", "0", "--height", "9"],
         &["solve", input, "--out", text(&out), "--iterations", "0"],
@@ -429,6 +431,22 @@ fn ctrl_c_ends_a_watch_with_130_and_tells_that_the_job_goes_on() {
     assert!(told.contains("the job goes on\n  scpsfm watch tenants/default/jobs/"), "{told}");
     let going_on = run(["list", "--state", "running", "--server", &serving.grpc]);
     assert_eq!(going_on.stdout.lines().count(), 1, "{going_on:?}");
+}
+
+#[test]
+fn a_quiet_demo_prints_nothing() {
+    let directory = directory();
+    let out = directory.path().join("demo");
+    let run = run(["demo", "-q", "--out", text(&out), "--outliers", "0.8", "--tracks", "100"]);
+    assert_eq!((run.code, run.stdout.as_str(), run.stderr.as_str()), (Some(0), "", ""));
+    assert!(out.join("report.html").exists());
+}
+
+#[test]
+fn standard_input_that_is_named_twice_is_refused_by_its_argument() {
+    let run = run(["submit", "-", "-", "--server", NOBODY]);
+    assert_eq!(run.code, Some(2), "{run:?}");
+    assert!(run.stderr.contains("INPUT: `-` is given twice"), "{run:?}");
 }
 
 #[test]

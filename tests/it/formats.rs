@@ -58,13 +58,16 @@ fn opensfm_tracks_become_a_colmap_model_that_is_read_again() {
     assert!(nothing.stderr.contains("--width and --height"), "{nothing:?}");
 
     let size = ["--width", "1000", "--height", "1000"];
-    let export = ["--export", "colmap,colmap-text,colmap-db", "--export", "opensfm,nerfstudio,bundler,bal"];
+    let refused = solve(&tracks, &path("refused"), &[&size[..], &["--export", "colmap,colmap-db"]].concat());
+    assert_eq!(refused.code, Some(2), "{refused:?}");
+    assert!(refused.stderr.contains("--export colmap-db: ") && refused.stderr.contains("no COLMAP database"));
+    assert!(refused.stdout.is_empty() && !path("refused").exists(), "before it is solved: {refused:?}");
+    let export = ["--export", "colmap,colmap-text", "--export", "opensfm,nerfstudio,bundler,bal"];
     let flags = [&size[..], &export[..]].concat();
     let solved = solve(&tracks, &path("local"), &flags);
     assert_eq!(solved.code, Some(0), "{solved:?}");
     assert_eq!(json(&solved.stdout)["inlier_tracks"], 30);
-    let refused = "warning: not exported: colmap-db: the input is no COLMAP database";
-    assert!(solved.stderr.contains(refused) && !path("local/colmap-db").exists(), "{solved:?}");
+    assert!(!solved.stderr.contains("not exported"), "{solved:?}");
     for file in ["nerfstudio/transforms.json", "nerfstudio/points.ply", "bundler/bundle.out", "bal/problem.txt"] {
         assert!(path("local").join(file).is_file(), "{file}");
     }
