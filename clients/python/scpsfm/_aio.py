@@ -264,6 +264,18 @@ class AsyncClient:
         """A job that is known by its name; no call is made. See `Client.job`."""
         return AsyncJob(self, flows.job_name(self._context, name), None, tracks)
 
+    async def retry(self, job: AsyncJob | str, *, timeout: float | None = None) -> AsyncJob:
+        """Queues a job again, or the one of this name; see `AsyncJob.retry`."""
+        job = self.job(job) if isinstance(job, str) else job
+        await job.retry(timeout=timeout)
+        return job
+
+    async def set_priority(self, job: AsyncJob | str, priority: int, *, timeout: float | None = None) -> AsyncJob:
+        """Changes the priority of a job, or of the one of this name; see `AsyncJob.set_priority`."""
+        job = self.job(job) if isinstance(job, str) else job
+        await job.set_priority(priority, timeout=timeout)
+        return job
+
     async def jobs(
         self, filter: str = "", *, order_by: str = "", page_size: int = 0, timeout: float | None = None
     ) -> AsyncIterator[AsyncJob]:
@@ -325,6 +337,18 @@ class AsyncJob:
         """Asks the job to stop; see `Job.cancel`."""
         request = job_service_pb2.CancelJobRequest(name=self.name, etag=etag)
         return self._told(await self._client._run(flows.call(self._client._context, "CancelJob", request, timeout)))
+
+    async def retry(self, *, etag: str = "", timeout: float | None = None) -> JobInfo:
+        """Queues the job again, which ended without a result; see `Job.retry`."""
+        request = job_service_pb2.RetryJobRequest(name=self.name, etag=etag)
+        return self._told(await self._client._run(flows.call(self._client._context, "RetryJob", request, timeout)))
+
+    async def set_priority(self, priority: int, *, etag: str = "", timeout: float | None = None) -> JobInfo:
+        """Changes the priority of the job, which must wait; see `Job.set_priority`."""
+        request = flows.priority_request(self.name, priority, etag)
+        return self._told(
+            await self._client._run(flows.call(self._client._context, "SetJobPriority", request, timeout))
+        )
 
     async def delete(self, *, etag: str = "", timeout: float | None = None) -> None:
         """Removes the job, which must have ended, with its input, events and result."""

@@ -341,6 +341,18 @@ class Client:
         """
         return Job(self, flows.job_name(self._context, name), None, tracks)
 
+    def retry(self, job: Job | str, *, timeout: float | None = None) -> Job:
+        """Queues a job again, or the one of this name; see `Job.retry`."""
+        job = self.job(job) if isinstance(job, str) else job
+        job.retry(timeout=timeout)
+        return job
+
+    def set_priority(self, job: Job | str, priority: int, *, timeout: float | None = None) -> Job:
+        """Changes the priority of a job, or of the one of this name; see `Job.set_priority`."""
+        job = self.job(job) if isinstance(job, str) else job
+        job.set_priority(priority, timeout=timeout)
+        return job
+
     def jobs(
         self, filter: str = "", *, order_by: str = "", page_size: int = 0, timeout: float | None = None
     ) -> Iterator[Job]:
@@ -431,6 +443,29 @@ class Job:
         """
         request = job_service_pb2.CancelJobRequest(name=self.name, etag=etag)
         return self._told(self._client._run(flows.call(self._client._context, "CancelJob", request, timeout)))
+
+    def retry(self, *, etag: str = "", timeout: float | None = None) -> JobInfo:
+        """Queues the job again, which ended without a result. One that waits or runs is answered as it is.
+
+        Args:
+            etag: `JobInfo.etag`; a job that has changed since is not queued again (`Aborted`).
+            timeout: Seconds for the call, with its repetitions.
+
+        """
+        request = job_service_pb2.RetryJobRequest(name=self.name, etag=etag)
+        return self._told(self._client._run(flows.call(self._client._context, "RetryJob", request, timeout)))
+
+    def set_priority(self, priority: int, *, etag: str = "", timeout: float | None = None) -> JobInfo:
+        """Changes the priority of the job, which must wait.
+
+        Args:
+            priority: Of the tenant's queued jobs, those of larger priority run first. -1000 to 1000.
+            etag: `JobInfo.etag`; a job that has changed since is left as it is (`Aborted`).
+            timeout: Seconds for the call, with its repetitions.
+
+        """
+        request = flows.priority_request(self.name, priority, etag)
+        return self._told(self._client._run(flows.call(self._client._context, "SetJobPriority", request, timeout)))
 
     def delete(self, *, etag: str = "", timeout: float | None = None) -> None:
         """Removes the job, which must have ended, with its input, events and result."""

@@ -5,6 +5,7 @@ The sync and the async client run the same flows, so that retries, resumption an
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
 import time
 import uuid
@@ -208,25 +209,48 @@ class JobOptions:
 
 def create_request(context: Context, options: JobOptions) -> job_service_pb2.CreateJobRequest:
     """A request without its input, with a request id, so that it can be made again where the answer is lost."""
-    try:
-        job = job_pb2.Job(labels=dict(options.labels or {}), priority=options.priority)
-        if options.time_limit is not None:
+    request = job_service_pb2.CreateJobRequest(parent=context.parent)
+    request.job.SetInParent()
+    job = request.job
+    with _argument("labels", "job.labels"):
+        job.labels.update(options.labels or {})
+    with _argument("priority", "job.priority"):
+        job.priority = options.priority
+    if options.time_limit is not None:
+        with _argument("time_limit", "job.time_limit"):
             job.time_limit.FromNanoseconds(round(options.time_limit * 1e9))
-        if options.settings is not None:
+    if options.settings is not None:
+        with _argument("settings", "job.settings"):
             job.settings.CopyFrom(options.settings.to_proto())
-        if options.webhook is not None:
+    if options.webhook is not None:
+        with _argument("webhook", "job.webhook"):
             job.webhook.url = options.webhook
-        return job_service_pb2.CreateJobRequest(
-            parent=context.parent,
-            job_id=options.job_id or "",
-            request_id=options.request_id or str(uuid.uuid4()),
-            job=job,
-        )
+    with _argument("job_id", "job_id"):
+        request.job_id = options.job_id or ""
+    with _argument("request_id", "request_id"):
+        request.request_id = options.request_id or str(uuid.uuid4())
+    return request
+
+
+def priority_request(name: str, priority: int, etag: str) -> job_service_pb2.SetJobPriorityRequest:
+    """A request for another priority of a job."""
+    request = job_service_pb2.SetJobPriorityRequest(name=name, etag=etag)
+    with _argument("priority", "priority"):
+        request.priority = priority
+    return request
+
+
+@contextlib.contextmanager
+def _argument(name: str, field: str) -> Iterator[None]:
+    """Names the argument that has no form in a message, such as one of another type."""
+    try:
+        yield
     except InvalidArgument:
         raise
-    except (TypeError, ValueError, OverflowError) as error:
+    except (AttributeError, TypeError, ValueError, OverflowError) as error:
+        what = f"a value that cannot be sent ({error})"
         raise InvalidArgument(
-            f"job: {error}", reason="INVALID_ARGUMENT", violations=[Violation("job", str(error))]
+            f"{name}: {what}", reason="INVALID_ARGUMENT", violations=[Violation(field, what)]
         ) from None
 
 

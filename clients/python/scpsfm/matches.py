@@ -80,7 +80,7 @@ class Matches:
         """
         self.keypoints = tuple(_positions(f"keypoints[{view}]", given) for view, given in enumerate(keypoints))
         if views is None:
-            views = _alike(len(self.keypoints), width, height, names, camera_groups, focal_prior)
+            views = _alike(self._FIELD, len(self.keypoints), width, height, names, camera_groups, focal_prior)
         elif (width, height, names, camera_groups, focal_prior) != (None,) * 5:
             raise _wrong("views", "give either views, or width, height, names, camera_groups and focal_prior")
         self.views = tuple(views)

@@ -186,7 +186,7 @@ class Tracks:
         tracks_of = _indices("track_index", track_index)
         if views is None:
             count = max([int(views_of.max()) + 1 if len(views_of) else 0, len(names or ()), len(camera_groups or ())])
-            views = _alike(count, width, height, names, camera_groups, focal_prior)
+            views = _alike(cls._FIELD, count, width, height, names, camera_groups, focal_prior)
         elif (width, height, names, camera_groups, focal_prior) != (None,) * 5:
             raise _invalid([("views", "give either views, or width, height, names, camera_groups and focal_prior")])
         return cls(
@@ -250,7 +250,7 @@ class Tracks:
                 raise _invalid([("depth", f"has the shape {np.shape(depth)}; {positions.shape[:2]} is needed")])
             depths = full.reshape(positions.shape[:2])[view_index, track_index]
         if views is None:
-            views = _alike(positions.shape[0], width, height, names, camera_groups, focal_prior)
+            views = _alike(cls._FIELD, positions.shape[0], width, height, names, camera_groups, focal_prior)
         return cls.from_arrays(
             view_index,
             track_index,
@@ -290,7 +290,7 @@ class Tracks:
         """
         from ._read.tables import read_csv
 
-        return read_csv(cls, Path(path), _size(width, height), names, focal_prior)
+        return read_csv(cls, Path(path), _size(cls._FIELD, width, height), names, focal_prior)
 
     @classmethod
     def from_opensfm(
@@ -319,7 +319,7 @@ class Tracks:
         """
         from ._read.tables import read_opensfm
 
-        return read_opensfm(cls, Path(path), _size(width, height), focal_sigma_log)
+        return read_opensfm(cls, Path(path), _size(cls._FIELD, width, height), focal_sigma_log)
 
     @classmethod
     def from_colmap_database(
@@ -483,13 +483,14 @@ def _api_path(path: str) -> str:
     return f"{_ARRAYS.get(array, array)}{bracket}{rest}"
 
 
-def _size(width: int | None, height: int | None) -> tuple[int, int] | None:
+def _size(field: str, width: int | None, height: int | None) -> tuple[int, int] | None:
     if (width is None) != (height is None):
-        raise _invalid([("views", "width and height are given together, or neither")])
+        raise _invalid([("views", "width and height are given together, or neither")], field=field)
     return None if width is None or height is None else (width, height)
 
 
 def _alike(
+    field: str,
     count: int,
     width: int | None,
     height: int | None,
@@ -497,10 +498,10 @@ def _alike(
     camera_groups: Sequence[int] | None,
     focal_prior: FocalPrior | None,
 ) -> tuple[View, ...]:
-    size = _size(width, height)
+    size = _size(field, width, height)
     for what, given in (("names", names), ("camera_groups", camera_groups)):
         if given is not None and len(given) != count:
-            raise _invalid([(what, f"has {len(given)} entries, there are {count} views")])
+            raise _invalid([(what, f"has {len(given)} entries, there are {count} views")], field=field)
     return tuple(
         View(
             name="" if names is None else names[index],

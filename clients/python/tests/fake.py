@@ -235,6 +235,20 @@ class Fake(
         self._end("CancelJob", context)
         return job
 
+    def RetryJob(self, request: Any, context: Any) -> Any:
+        self._begin("RetryJob", request, context)
+        job = self._job(request.name, context)
+        job.state = job_pb2.JOB_STATE_QUEUED
+        self._end("RetryJob", context)
+        return job
+
+    def SetJobPriority(self, request: Any, context: Any) -> Any:
+        self._begin("SetJobPriority", request, context)
+        job = self._job(request.name, context)
+        job.priority = request.priority
+        self._end("SetJobPriority", context)
+        return job
+
     def DeleteJob(self, request: Any, context: Any) -> Any:
         self._begin("DeleteJob", request, context)
         self._job(request.name, context)

@@ -538,6 +538,22 @@ def test_a_timeout_that_is_none_is_refused(client: Any, timeout: float) -> None:
         client.capabilities(timeout=timeout)
 
 
+def test_a_job_is_queued_again_and_has_another_priority(client: Any, fake: Fake, small: scene.Scene) -> None:
+    job = client.submit(small.tracks)
+    fake.before["RetryJob"] = [away()]
+    assert job.retry(etag="e").state == "QUEUED"
+    assert [(call.name, call.etag) for call in fake.calls["RetryJob"]] == [(job.name, "e")] * 2
+    job.set_priority(7, etag="e")
+    (call,) = fake.calls["SetJobPriority"]
+    assert (call.name, call.priority, call.etag) == (job.name, 7, "e")
+    with pytest.raises(scpsfm.InvalidArgument, match=r"^priority: "):
+        job.set_priority(2**40)
+    assert client.retry(job.name).known.state == "QUEUED"
+    assert client.set_priority(job.name, -3).name == job.name
+    assert fake.calls["RetryJob"][-1].name == job.name
+    assert fake.calls["SetJobPriority"][-1].priority == -3
+
+
 def test_settings_of_the_wrong_kind_are_named_before_anything_is_sent(
     client: Any, fake: Fake, small: scene.Scene
 ) -> None:
@@ -551,10 +567,19 @@ def test_settings_of_the_wrong_kind_are_named_before_anything_is_sent(
             with pytest.raises(scpsfm.InvalidArgument) as raised:
                 call(small.tracks, settings)
             assert raised.value.field == field
-    for named in ({"labels": {"a": 1}}, {"priority": 2**40}, {"time_limit": float("nan")}):
-        with pytest.raises(scpsfm.InvalidArgument) as raised:
-            client.submit(small.tracks, **named)
-        assert raised.value.field == "job"
+    wrong: list[tuple[str, Any, str]] = [
+        ("labels", {"a": 1}, "job.labels"),
+        ("labels", 5, "job.labels"),
+        ("priority", 2**40, "job.priority"),
+        ("time_limit", float("nan"), "job.time_limit"),
+        ("webhook", 5, "job.webhook"),
+        ("job_id", 5, "job_id"),
+        ("request_id", 5, "request_id"),
+    ]
+    for name, value, field in wrong:
+        with pytest.raises(scpsfm.InvalidArgument, match=f"^{name}: ") as raised:
+            client.submit(small.tracks, **{name: value})
+        assert raised.value.field == field
     assert not fake.calls["CreateJob"]
     assert not fake.calls["Solve"]
 

@@ -71,6 +71,9 @@ def test_empty_pairs_are_left_out_and_a_match_counts_once() -> None:
         ({"keypoints": [*KEYPOINTS[:2], [1, 2, 3]]}, "keypoints[2]", "two numbers an entry"),
         ({"keypoints": KEYPOINTS[:1]}, "views", "at least 2"),
         ({"views": [View()] * 2}, "views", "keypoints of 3 views"),
+        ({"names": ["a"]}, "names", "has 1 entries, there are 3"),
+        ({"camera_groups": [0]}, "camera_groups", "has 1 entries"),
+        ({"width": 640}, "views", "width and height"),
         ({"names": ["a", "b", "a"]}, "views[2].name", "name of view 0"),
     ],
 )

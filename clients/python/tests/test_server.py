@@ -297,6 +297,11 @@ def test_a_job_is_cancelled_and_waits_are_given_up(real: Any) -> None:
         job.result()
     assert raised.value.job == job.name
     assert job.cancel().state == "CANCELLED"
+    assert not job.retry().state.is_final
+    job.cancel()
+    assert job.wait().state == "CANCELLED"
+    with pytest.raises(scpsfm.FailedPrecondition):
+        job.set_priority(1)
     job.delete()
 
 
