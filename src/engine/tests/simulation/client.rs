@@ -21,8 +21,12 @@ const MOST_REQUESTS: u64 = 24;
 pub(super) struct Known {
     /// Sequence number of the last event that it saw.
     pub after: u64,
-    /// The job's end, once it saw it.
+    /// The last state that it saw.
+    state: Option<JobState>,
+    /// The job's end, once a watch has told it and come to an end.
     pub end: Option<JobState>,
+    /// How often it asked for another try of a job that had ended.
+    pub retries: usize,
     /// Somebody follows it now.
     watched: bool,
     /// Its deletion was asked for: it may be gone.
@@ -84,10 +88,15 @@ impl Clients {
     pub(super) fn call(&mut self, server: &Server) {
         let history = self.history.clone();
         let known = locked(&history).jobs.keys().cloned().choose(&mut self.rng);
-        match (self.rng.random_range(0..10), known) {
+        match (self.rng.random_range(0..12), known) {
             (0..=1, Some(name)) => server.spawn(|engine| watch(engine, name, history)),
             (2, Some(name)) => server.spawn(|engine| cancel(engine, name, history)),
             (3, Some(name)) => server.spawn(|engine| delete(engine, name, history)),
+            (4, Some(name)) => server.spawn(|engine| retry(engine, name, history)),
+            (5, Some(name)) => {
+                let priority = self.rng.random_range(0..3);
+                server.spawn(|engine| set_priority(engine, name, priority, history));
+            }
             _ => {
                 let sent = self.history().sent;
                 // A new request, or one that was sent before.
@@ -103,6 +112,19 @@ impl Clients {
                 server.spawn(|engine| submit(engine, number, history));
             }
         }
+    }
+
+    /// The operator pauses the queue, or lets it go on.
+    pub(super) fn set_paused(&self, server: &Server, paused: bool) {
+        let history = self.history.clone();
+        server.spawn(move |engine| async move {
+            let answer = if paused { engine.pause().await } else { engine.resume().await };
+            match answer {
+                Ok(()) => {}
+                Err(error) if is_failure(&error) => {}
+                Err(error) => locked(&history).violated(format!("pause of the queue: {error}")),
+            }
+        });
     }
 
     /// Everyone who waits for the end of a job goes on with that.
@@ -174,6 +196,32 @@ async fn delete(engine: Engine, name: JobName, history: Arc<Mutex<History>>) {
     }
 }
 
+async fn retry(engine: Engine, name: JobName, history: Arc<Mutex<History>>) {
+    match locked(&history).jobs.get_mut(&name) {
+        Some(known) if !known.deleted && known.end.is_some_and(|end| end != JobState::Succeeded) => {
+            // Before: whether an answer that is lost was a yes is not known.
+            known.end = None;
+            known.retries += 1;
+        }
+        _ => return,
+    }
+    match engine.retry(&name, None).await {
+        // Another client may have retried it, or deleted it.
+        Ok(_) | Err(Error::NotFound(_) | Error::QueueFull { .. } | Error::Succeeded(_)) => {}
+        Err(error) if is_failure(&error) => {}
+        Err(error) => locked(&history).violated(format!("retry of {name}: {error}")),
+    }
+}
+
+async fn set_priority(engine: Engine, name: JobName, priority: i32, history: Arc<Mutex<History>>) {
+    match engine.set_priority(&name, None, priority).await {
+        Ok(_) | Err(Error::NotQueued(..)) => {}
+        Err(error) if is_failure(&error) => {}
+        Err(Error::NotFound(_)) if locked(&history).jobs.get(&name).is_none_or(|known| known.deleted) => {}
+        Err(error) => locked(&history).violated(format!("priority of {name}: {error}")),
+    }
+}
+
 /// Follows a job from the last event that was seen.
 async fn watch(engine: Engine, name: JobName, history: Arc<Mutex<History>>) {
     let after = match locked(&history).jobs.get_mut(&name) {
@@ -199,13 +247,22 @@ async fn watch(engine: Engine, name: JobName, history: Arc<Mutex<History>>) {
         };
         let Some(sequence) = event.sequence else { continue };
         let Some(known) = history.jobs.get_mut(&name) else { return };
-        let (before, end) = (known.after, known.end);
+        let (before, state_before, retries) = (known.after, known.state, known.retries);
         known.after = sequence;
         if let EventBody::State { state, .. } = event.body {
-            known.end = Some(state).filter(|state| state.is_terminal());
+            known.state = Some(state);
         }
-        if sequence != before + 1 || end.is_some() {
-            history.violated(format!("{name}: event {sequence} came after {before} and the end {end:?}"));
+        let ended_before = state_before.is_some_and(JobState::is_terminal);
+        if sequence != before + 1 || ended_before && retries == 0 {
+            history.violated(format!("{name}: event {sequence} came after {before} in the state {state_before:?}"));
+        }
+    }
+    // The end of the stream tells that the last end is the last.
+    if let Some(known) = locked(&history).jobs.get_mut(&name) {
+        known.end = known.state.filter(|state| state.is_terminal());
+        let state = known.state;
+        if known.end.is_none() {
+            locked(&history).violated(format!("the events of {name} end in the state {state:?}"));
         }
     }
 }

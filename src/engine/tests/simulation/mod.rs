@@ -114,7 +114,11 @@ impl<const SHARED: bool> Simulation<SHARED> {
             if self.rng.random_bool(self.plan.calls) {
                 let up: Vec<&Server> = self.servers.iter().flatten().filter(|server| server.is_up()).collect();
                 if let Some(server) = up.choose(&mut self.rng) {
-                    self.clients.call(server);
+                    match self.rng.random_range(0..40) {
+                        0 => self.clients.set_paused(server, true),
+                        1..=3 => self.clients.set_paused(server, false),
+                        _ => self.clients.call(server),
+                    }
                 }
             }
             self.step()?;
@@ -130,6 +134,9 @@ impl<const SHARED: bool> Simulation<SHARED> {
                 }
                 let first = self.servers.iter().flatten().find(|server| server.is_up());
                 if let Some(server) = first {
+                    if check::is_paused(&self.cluster) {
+                        self.clients.set_paused(server, false);
+                    }
                     self.clients.watch_all(server);
                 }
                 if self.clients.all_is_seen() && check::open_jobs(&self.cluster) == 0 {
