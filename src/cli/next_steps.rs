@@ -7,8 +7,8 @@ use crate::domain::job::Summary;
 use crate::domain::{Grade, Solution, Status, Warning, WarningCode};
 use crate::formats::{Export, Format, result_files};
 
-/// Warnings that can be why a result is less than METRIC, the likeliest cause first, each with what would help. A wrong
-/// size or a wrong model comes before what the views show under it.
+/// Warnings that can be why a result is less than METRIC, the most probable cause first, each with what would help. A
+/// wrong size or a wrong model comes before what the views show under it.
 const REMEDIES: [(WarningCode, &str); 14] = [
     (WarningCode::PointsOutsideImage, "give the size of the images whose pixels these are (--width, --height)"),
     (

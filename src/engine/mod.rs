@@ -190,7 +190,7 @@ struct Inner {
     store: Arc<dyn Store>,
     notifier: Arc<notifier::Notifier>,
     /// Attempts that run in this process or are prefetched, for a cancel to reach them at once.
-    running: Mutex<running::Attempts>,
+    running: Mutex<running::RunningAttempts>,
     /// Counts the reasons to look for a job to claim; slots wait for a change.
     work: channel::Sender<u64>,
     /// Wakes the task that counts the queue.

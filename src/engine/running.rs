@@ -9,7 +9,7 @@ use crate::domain::{StopReason, StopToken};
 use crate::store::Lease;
 
 /// The attempts of this process by their leases, prefetched ones too.
-pub(super) type Attempts = HashMap<Lease, Listed>;
+pub(super) type RunningAttempts = HashMap<Lease, Listed>;
 
 /// What others need to know of an attempt.
 #[derive(Debug)]

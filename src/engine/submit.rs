@@ -60,8 +60,8 @@ pub struct NewJob {
     pub webhook_url: Option<String>,
 }
 
-/// Observations that are encoded on a thread that serves others: a fraction of a millisecond's work, less than a
-/// thread takes to wake up beside busy solvers.
+/// Observations that are encoded on a thread that serves others: some 40 kB to encode and to hash, which needs no
+/// thread of its own.
 const FEW_OBSERVATIONS: usize = 2_000;
 
 impl NewJob {

@@ -353,9 +353,9 @@ pub trait Store: Send + Sync + 'static {
     /// What is to be sent to the webhooks of jobs that have ended.
     async fn webhook_queue(&self, now: SystemTime) -> Result<WebhookQueue, Error>;
 
-    /// Leases the delivery of a job's end that is due the longest, passing over some hosts and tenants, and counts an
-    /// attempt at it. Returns the job as it stands then; `None` where nothing is due. A delivery whose lease runs out
-    /// is due again.
+    /// Leases the delivery of a job's end that is due, passing over some hosts and tenants, and counts an attempt at
+    /// it: first attempts in the order of the jobs, then what is due the longest. Returns the job as it stands then;
+    /// `None` where nothing is due. A delivery whose lease runs out is due again.
     async fn claim_webhook(
         &self,
         passed: &PassedOver,
