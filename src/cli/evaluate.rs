@@ -309,7 +309,7 @@ pub(super) fn build() -> Result<String, Failure> {
     let program = std::fs::read(std::env::current_exe()?)?;
     let program = Sha256Digest(Sha256::digest(&program).into());
     // Another network gives other figures.
-    let network = crate::network::subspace::current_sha256();
+    let network = scpsfm_core::subspace::current_sha256();
     Ok(format!("{} {program:.16} {network:.16}", env!("CARGO_PKG_VERSION")))
 }
 

@@ -14,7 +14,7 @@ use crate::domain::StopToken;
 use crate::evaluation::priors::{self, Plan, scenes, sweep, table};
 use crate::evaluation::records;
 use crate::formats::publish::{create_directory, pretty, write_atomically};
-use crate::network::subspace;
+use scpsfm_core::subspace;
 
 /// The comparison of priors instead of the sweeps.
 #[derive(Debug, Clone, clap::Args)]

@@ -3,7 +3,7 @@
 use std::path::{Path, PathBuf};
 
 use super::exit::Failure;
-use crate::network::subspace::{self, PriorFile};
+use scpsfm_core::subspace::{self, PriorFile};
 
 /// Which trained network to ask.
 #[derive(Debug, Clone, clap::Args)]

@@ -11,9 +11,9 @@ use super::args::parse_whole;
 use super::exit::{Exit, Failure};
 use super::interrupt::Interrupt;
 use crate::formats::publish::{create_directory, write_atomically};
-use crate::network::subspace::{PriorFile, Shape};
 use crate::report::chart::{LineChart, Series, standalone};
 use crate::training::{Milestone, Objective, Settings, Trainer};
+use scpsfm_core::subspace::{PriorFile, Shape};
 
 /// Steps of the shipped network.
 const STEPS: u64 = 7_000;

@@ -1,40 +1,14 @@
-//! What the service talks about: inputs, settings, progress, results, jobs and their limits.
+//! What the service talks about: jobs, webhooks, names and quotas, and what solvers are given and return.
 //!
-//! Pure data and rules: no I/O, no async, no linear algebra. Everything else may depend on this module; it depends
-//! on nothing of ours.
+//! Pure data and rules: no I/O, no async. Everything else may depend on this module; it depends on nothing of ours but
+//! the domain of [`scpsfm_core`].
 
-pub mod digest;
-pub mod duplicates;
-pub mod error;
-pub mod input;
-mod input_digest;
 pub mod input_name;
 pub mod job;
-pub mod joining;
-pub mod left_out;
-pub mod limits;
-pub mod matches;
-pub mod progress;
 pub mod quota;
-pub mod result;
-pub mod settings;
-pub mod stop;
-pub mod warning;
 pub mod webhook;
 
-pub use digest::Sha256Digest;
-pub use error::{InvalidInput, Violation};
-pub use input::{FocalPrior, ImageSize, Input, RawInput, View};
 pub use input_name::InputName;
-pub use left_out::LeftOut;
-pub use limits::Limits;
-pub use matches::{JoinedTracks, Joining, PairMatches, RawMatches};
-pub use progress::{
-    HeadProgress, Losses, Observer, Phase, Progress, ReconstructionProgress, Silent, Stage, Step, Task,
-};
 pub use quota::{Oversize, Quota};
-pub use result::{Calibration, Grade, LensProjection, Proposal, Solution, Status};
-pub use settings::{Backend, Method, SolveSettings};
-pub use stop::{StopReason, StopToken};
-pub use warning::{Warning, WarningCode};
+pub use scpsfm_core::domain::*;
 pub use webhook::{Webhook, WebhookState};

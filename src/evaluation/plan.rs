@@ -7,7 +7,7 @@ use super::sweeps::Sweep;
 use crate::domain::{Method, Proposal, SolveSettings};
 use crate::synthetic::SceneOptions;
 
-named! {
+scpsfm_core::named! {
     /// How projective depths come to the contestants.
     #[derive(PartialOrd, Ord)]
     pub enum Depths {

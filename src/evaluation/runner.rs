@@ -1,12 +1,12 @@
 //! What a run of a sweep is: its scene made, its contestant asked, its answer measured.
 
-use super::measures::Measures;
-use super::oracle;
 use super::plan::Run;
 use super::records;
 use crate::domain::{Input, Limits, Silent, StopToken};
 use crate::solver;
 use crate::synthetic::Scene;
+use scpsfm_core::evaluation::measures::Measures;
+use scpsfm_core::evaluation::oracle;
 
 /// The file of the sweeps' records.
 pub const RECORDS: &str = "runs.jsonl";

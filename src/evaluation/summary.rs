@@ -4,12 +4,12 @@ use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 use serde::Serialize;
 
-use super::measures::Measures;
 use super::plan::{Contestant, Depths, Plan, Run};
 use super::runner::Records;
 use crate::domain::Grade;
 use crate::geometry::statistics::midpoint_median;
 use crate::synthetic::{Motion, SceneOptions, Shape};
+use scpsfm_core::evaluation::measures::Measures;
 
 /// Resamples of a bootstrap interval, its seed, and the share on either side that it leaves out.
 const RESAMPLES: usize = 2_000;

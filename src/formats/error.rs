@@ -131,11 +131,12 @@ impl Groupable for Problem {
 /// Collects problems; a file with a million wrong lines needs no million sentences.
 pub(super) type Problems = Listing<Problem>;
 
-impl Problems {
-    pub(super) fn into_result(self, file: &str) -> Result<(), Error> {
-        match self.into_parts() {
+impl Error {
+    /// `Err` with all problems of a file, `Ok` when there are none.
+    pub(super) fn check(file: &str, problems: Problems) -> Result<(), Self> {
+        match problems.into_parts() {
             (problems, _) if problems.is_empty() => Ok(()),
-            (problems, unlisted) => Err(Error { file: file.into(), problems, unlisted }),
+            (problems, unlisted) => Err(Self { file: file.into(), problems, unlisted }),
         }
     }
 }

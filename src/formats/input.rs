@@ -93,7 +93,7 @@ impl LabelledInput {
             problems.push(self.problem(violation));
         }
         problems.add_unlisted(unlisted);
-        match problems.into_result(&self.display_path()) {
+        match Error::check(&self.display_path(), problems) {
             Err(error) => error,
             Ok(()) => Error::whole(&self.display_path(), "was refused without a reason"),
         }
@@ -166,7 +166,7 @@ impl LabelledInput {
             );
             problems.push(Problem::at_line(self.lines[later], "track", what));
         }
-        problems.into_result(&self.display_path())
+        Error::check(&self.display_path(), problems)
     }
 }
 

@@ -99,7 +99,7 @@ fn parse(reader: impl BufRead, path: &Path, limits: &Limits, size: Option<ImageS
     if columns.is_none() {
         return Err(Error::whole(&file, "is empty; a header `view,track,x,y` is needed"));
     }
-    problems.into_result(&file)?;
+    Error::check(&file, problems)?;
     if table.lines.is_empty() {
         return Err(Error::whole(&file, "has a header but no observations"));
     }

@@ -2,7 +2,6 @@
 //! on the same files. [`conditions`] are the inputs, [`table`] shows the rows. The photographed scenes are inputs, too;
 //! [`super::photographed`] has their plan and their tables.
 
-mod bound;
 pub mod conditions;
 mod sample;
 mod solvers;

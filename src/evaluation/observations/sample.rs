@@ -1,8 +1,8 @@
 //! Inputs with their truth.
 
+use scpsfm_core::evaluation::bound;
 use serde::{Deserialize, Serialize};
 
-use super::bound;
 use crate::domain::error::InvalidInput;
 use crate::domain::{ImageSize, RawInput};
 use crate::synthetic::photographed::IMAGE_SIZE;

@@ -2,14 +2,13 @@
 //! search ([`alone`]), and AUTO with and without the network that was trained beforehand. [`scenes`] are the scenes,
 //! [`table`] shows the rows; [`sweep`] is where a constant of the search comes from.
 
-mod alone;
 pub mod scenes;
 pub mod sweep;
 pub mod table;
 
 use serde::{Deserialize, Serialize};
 
-use alone::Study;
+use scpsfm_core::evaluation::proposal::Study;
 
 use crate::domain::{Input, Limits, Proposal, Silent, SolveSettings, Status, StopToken};
 use crate::evaluation::records;

@@ -4,11 +4,11 @@
 use serde::{Deserialize, Serialize};
 
 use super::Condition;
-use super::alone::Study;
 use crate::domain::{Input, Limits, StopToken};
 use crate::evaluation::records;
 use crate::synthetic::metrics::average_precision;
 use crate::synthetic::{Scene, SceneOptions};
+use scpsfm_core::evaluation::proposal::Study;
 
 /// Costs that are tried, in units of the truncated cost of a track at even odds; 0: the network only draws the samples.
 pub const COSTS_PER_NAT: [f64; 7] = [0.0, 0.05, 0.1, 0.15, 0.2, 0.3, 0.5];

@@ -6,8 +6,8 @@ use nalgebra::Vector3;
 use serde::Serialize;
 
 use super::Sequence;
-use crate::evaluation::measures::aligned;
 use crate::synthetic::metrics::agreement;
+use scpsfm_core::evaluation::measures::aligned;
 
 /// Centres that a similarity must be held by: with three, its seven unknowns stand against nine equations.
 const LEAST_CENTRES: usize = 3;

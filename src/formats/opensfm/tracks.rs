@@ -57,7 +57,7 @@ pub fn read(
             problems.push(Problem::at_line(number, column, what));
         }
     }
-    problems.into_result(&file)?;
+    Error::check(&file, problems)?;
     if table.lines.is_empty() {
         return Err(Error::whole(&file, "has no observations"));
     }

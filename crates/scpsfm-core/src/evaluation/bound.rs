@@ -8,7 +8,7 @@ use crate::geometry::bundle::metric::{
 };
 use crate::geometry::observation::Observation;
 use crate::solver::calibration::CalibrationOptions;
-use crate::synthetic::photographed::{IMAGE_SIZE, LensKind, PhotographedMotion, effective_noise};
+use crate::synthetic::photographed::{FocalKind, IMAGE_SIZE, LensKind, PhotographedMotion, effective_noise};
 use crate::synthetic::scene::IMAGE_SIDE_PX;
 use crate::synthetic::{Photographed, Scene};
 
@@ -127,7 +127,7 @@ fn smallest_model(scene: &Photographed) -> IntrinsicsModel {
         (Extension::RadialK1, options.radial != [0.0; 2]),
         (Extension::RadialK2, options.radial[1] != 0.0),
     ];
-    let simplest = IntrinsicsModel::focal(super::Declared::of(options) == super::Declared::FocalPerView);
+    let simplest = IntrinsicsModel::focal(options.focal == FocalKind::DriftingFocal);
     let with = |model: IntrinsicsModel, (extension, needed)| if needed { model.with(extension) } else { model };
     needed.into_iter().fold(simplest, with)
 }

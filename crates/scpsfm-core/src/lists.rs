@@ -21,6 +21,7 @@ macro_rules! options {
 }
 
 /// An enumeration, all of its values and the name of each, on the command line and in files, from one list.
+#[macro_export]
 macro_rules! named {
     (
         $(#[$about:meta])*

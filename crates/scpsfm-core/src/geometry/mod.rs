@@ -3,27 +3,28 @@
 //!
 //! f64 throughout. May depend on `domain` (the stop token) and linear algebra; knows nothing of networks, jobs or I/O.
 
-pub mod bundle;
-pub mod critical;
-pub mod daq;
-pub mod epipolar_depths;
-pub mod factorization;
-pub mod fundamental;
-pub mod homography;
+pub(crate) mod bundle;
+pub(crate) mod critical;
+pub(crate) mod daq;
+pub(crate) mod epipolar_depths;
+pub(crate) mod factorization;
+pub(crate) mod fundamental;
+pub(crate) mod homography;
 mod levenberg_marquardt;
-pub mod measurement;
-pub mod metric;
+pub(crate) mod measurement;
+pub(crate) mod metric;
 mod null_vector;
-pub mod observation;
-pub mod planar;
-pub mod pose;
-pub mod procrustes;
+pub(crate) mod observation;
+pub(crate) mod planar;
+pub(crate) mod pose;
+pub(crate) mod procrustes;
 mod ransac;
-pub mod resection;
-pub mod robust_triangulation;
+pub(crate) mod resection;
+pub(crate) mod robust_triangulation;
 pub mod statistics;
-pub mod triangulation;
+pub(crate) mod triangulation;
 
+pub use fundamental::matrix_of_cameras;
 use nalgebra::{Matrix3x4, Vector4};
 
 /// Projective camera, 3x4, defined up to scale.

@@ -158,8 +158,7 @@ pub struct Sigmas {
 
 impl Calibration {
     /// Square pixels, no distortion and no uncertainty.
-    #[cfg(test)]
-    pub(crate) fn pinhole(focal_px: f64, principal_point_px: [f64; 2]) -> Self {
+    pub fn pinhole(focal_px: f64, principal_point_px: [f64; 2]) -> Self {
         Self {
             focal_px,
             sigma_log_focal: None,

@@ -293,7 +293,7 @@ fn check_counts(raw: &RawInput, limits: &Limits, field: &impl Fn(&str) -> String
 }
 
 /// What is wrong with fewer than two views.
-pub(crate) fn too_few_views(count: usize) -> String {
+pub fn too_few_views(count: usize) -> String {
     let given = if count == 1 { "1 view" } else { "no views" };
     format!("{given} given, at least 2 are needed")
 }
