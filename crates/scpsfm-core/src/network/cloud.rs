@@ -1,6 +1,6 @@
 //! The network on one cloud of columns, with the focal length beside it: what every loss here optimises.
 
-use burn::tensor::{Device, Tensor};
+use burn_tensor::{Device, Tensor};
 use nalgebra::DMatrix;
 
 use super::parameter::Parameter;

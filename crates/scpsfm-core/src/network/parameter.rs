@@ -1,6 +1,6 @@
 //! One learnable array and its Adam state.
 
-use burn::tensor::{Device, Tensor, TensorData};
+use burn_tensor::{Device, Tensor, TensorData};
 use serde::{Deserialize, Serialize};
 
 /// Decay of the mean of gradients (Kingma & Ba 2015, algorithm 1).

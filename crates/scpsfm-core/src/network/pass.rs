@@ -9,7 +9,7 @@
 //! and `p = Σ_j D_j R_j` along rows: `db = Σ_j D_j`, `dgain = p / sqrt(var + ε)`, `dR = s ⊙ D - s p / (m (var + ε)) ⊙
 //! R`, `dW = dR Xᵀ`, `dX = Wᵀ dR`.
 
-use burn::tensor::{Device, Tensor};
+use burn_tensor::{Device, Tensor};
 
 use super::Error;
 use super::lanes::{dot, maximum, sum};

@@ -15,7 +15,7 @@
 //! Subtracting the mean commutes with `W`: `W X - mean(W X) = W (X - mean X)`. The layers here centre their input,
 //! which is the narrower side.
 
-use burn::tensor::{Device, Tensor, TensorData};
+use burn_tensor::{Device, Tensor, TensorData};
 use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 

@@ -1,7 +1,7 @@
 //! The same network on burn's autodiff: what the pass that is written out is compared with.
 
-use burn::tensor::activation::relu;
-use burn::tensor::{Device, Tensor};
+use burn_tensor::activation::relu;
+use burn_tensor::{Device, Tensor};
 use rand::SeedableRng;
 use rand_chacha::ChaCha8Rng;
 

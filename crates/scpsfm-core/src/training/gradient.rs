@@ -1,6 +1,6 @@
 //! Training scenes as tensors, and the derivatives of their loss.
 
-use burn::tensor::{DType, Device, Tensor};
+use burn_tensor::{DType, Device, Tensor};
 
 use super::labelled::{self, Labels};
 use super::tape::{Batch, constant, numbers};

@@ -1,7 +1,7 @@
 //! Learning from labels: binary cross-entropy of tracks after every block and of observations after the last.
 
-use burn::tensor::Tensor;
-use burn::tensor::activation::log_sigmoid;
+use burn_tensor::Tensor;
+use burn_tensor::activation::log_sigmoid;
 
 use super::objective::{Loss, importance};
 use super::tape::Output;

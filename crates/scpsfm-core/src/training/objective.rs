@@ -1,6 +1,6 @@
 //! What training minimises.
 
-use burn::tensor::Tensor;
+use burn_tensor::Tensor;
 use serde::{Deserialize, Serialize};
 
 /// Weight of the first block's tracks; the last one's is 1, linear between (deep supervision: early blocks learn to

@@ -18,8 +18,8 @@
 //!
 //! Shapes: `B` scenes, `P` pairs of `n` views, `m` tracks.
 
-use burn::tensor::activation::sigmoid;
-use burn::tensor::{DType, Device, Tensor};
+use burn_tensor::activation::sigmoid;
+use burn_tensor::{DType, Device, Tensor};
 use nalgebra::{SMatrix, SymmetricEigen};
 
 use super::Error;

@@ -9,8 +9,8 @@
 //!
 //! Shapes: `B` scenes, `n` views, `m` tracks; features come before tracks, so that sums run along memory.
 
-use burn::tensor::activation::{relu, sigmoid, softmax};
-use burn::tensor::{DType, Device, Tensor, TensorData};
+use burn_tensor::activation::{relu, sigmoid, softmax};
+use burn_tensor::{DType, Device, Tensor, TensorData};
 use nalgebra::DMatrix;
 
 use super::Error;

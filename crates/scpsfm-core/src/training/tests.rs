@@ -1,4 +1,4 @@
-use burn::tensor::{DType, Device, Tensor};
+use burn_tensor::{DType, Device, Tensor};
 
 use super::gradient::{differentiate, tensors};
 use super::labelled::loss;

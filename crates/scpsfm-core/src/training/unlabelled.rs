@@ -17,8 +17,8 @@
 //! L_DAQ has no part in it: it needs coordinates in which the principal point is known, and a scene's points come with
 //! any origin. Observations have no loss of their own, so a network that learned this way ranks tracks only.
 
-use burn::tensor::activation::sigmoid;
-use burn::tensor::{DType, Tensor};
+use burn_tensor::activation::sigmoid;
+use burn_tensor::{DType, Tensor};
 use nalgebra::DMatrix;
 
 use super::Error;
