@@ -15,6 +15,7 @@ use tracing::{Instrument, Span};
 
 use super::Inner;
 use super::observe::{self, Attempt, AttemptLost};
+use super::room::Place;
 use super::running::Running;
 use super::worker::{Assignment, AttemptHandle, Report, Started, Verdict, Worker};
 use crate::domain::job::{Failure, Job, JobName, JobState};
@@ -30,7 +31,7 @@ const PROGRESS_PERIOD: Duration = Duration::from_millis(500);
 const FIRST_PROGRESS: Duration = Duration::from_millis(100);
 
 /// Heartbeats within the time of a lease: two may be lost.
-const HEARTBEATS_A_LEASE: u32 = 3;
+pub(super) const HEARTBEATS_A_LEASE: u32 = 3;
 
 /// How long a late heartbeat may take: one that finds that the lease has run out asks whether it was taken over.
 const LATE_HEARTBEAT: Duration = Duration::from_secs(1);
@@ -76,6 +77,8 @@ pub(super) struct JobExecution {
     /// The last progress that was stored.
     stored: Option<Progress>,
     running: Running,
+    /// Held until its end is stored, or given up.
+    _place: Place,
 }
 
 /// An attempt in a worker's hands.
@@ -100,7 +103,7 @@ fn stop_token(job: &Job, now: SystemTime) -> StopToken {
 
 impl JobExecution {
     /// Of a job that is leased: claimed, or prefetched for so long.
-    pub(super) fn new(inner: Arc<Inner>, claimed: Claimed, lease_for: Duration) -> Self {
+    pub(super) fn new(inner: Arc<Inner>, claimed: Claimed, lease_for: Duration, place: Place) -> Self {
         let Claimed { job, lease, trace_parent, queue_time } = claimed;
         let stop = stop_token(&job, inner.now());
         let running = Running::list(inner.clone(), &lease, &stop, job.state == JobState::Running);
@@ -117,6 +120,7 @@ impl JobExecution {
             lost: false,
             stored: None,
             running,
+            _place: place,
         };
         if execution.is_begun() {
             let Lease { name, attempt } = &execution.lease;
@@ -382,7 +386,7 @@ impl Loaded {
         let begun = (&mut handle.started).await.ok()?;
         let prefetched = (execution.lease.clone(), execution.job.create_time);
         let now = execution.inner.now();
-        let claims = execution.inner.claim(Some(prefetched), now).instrument(begun.span.clone()).await;
+        let claims = execution.inner.claim(Some(prefetched), false, now).instrument(begun.span.clone()).await;
         let Some(claimed) = claims.begun else {
             execution.lapse();
             // Until then the worker is not free. Its outcome is dropped.

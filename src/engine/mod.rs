@@ -9,6 +9,7 @@ mod execution;
 mod notifications;
 mod notifier;
 mod observe;
+mod room;
 mod running;
 mod slot;
 mod submit;
@@ -191,6 +192,7 @@ struct Inner {
     notifier: Arc<notifier::Notifier>,
     /// Attempts that run in this process or are prefetched, for a cancel to reach them at once.
     running: Mutex<running::RunningAttempts>,
+    room: room::Room,
     /// Counts the reasons to look for a job to claim; slots wait for a change.
     work: channel::Sender<u64>,
     /// Wakes the task that counts the queue.
@@ -233,6 +235,7 @@ impl Engine {
             store,
             notifier: Arc::default(),
             running: Mutex::default(),
+            room: room::Room::new(),
             work: channel::Sender::new(0),
             queue_changed: Notify::new(),
             webhook_due: Notify::new(),
