@@ -78,6 +78,8 @@ pub struct Options {
     pub lease: Duration,
     /// Attempts that may be lost before a job fails.
     pub max_attempts: u32,
+    /// Bytes of memory that the jobs which run at once are estimated to take together.
+    pub max_solver_bytes: u64,
     pub uploads: UploadOptions,
     /// How long ended jobs are kept, and uploaded inputs that no job has; `None`: for good.
     pub retention: Option<Duration>,
@@ -119,6 +121,12 @@ impl Options {
     pub const DEFAULT_SHORT_JOB: Duration = Duration::from_millis(100);
     /// About the time of one job.
     pub const DEFAULT_RETRY_AFTER: Duration = Duration::from_secs(3);
+
+    /// Three quarters of the memory of the machine or container, where the system tells: the rest is for calls, the
+    /// store and the program.
+    pub fn default_solver_bytes() -> u64 {
+        room::memory_bytes().map_or(u64::MAX, |bytes| bytes / 4 * 3)
+    }
 }
 
 impl Default for Options {
@@ -138,6 +146,7 @@ impl Default for Options {
             uploads: UploadOptions::default(),
             lease: Self::DEFAULT_LEASE,
             max_attempts: Self::DEFAULT_MAX_ATTEMPTS,
+            max_solver_bytes: Self::default_solver_bytes(),
             retention: Some(Self::DEFAULT_RETENTION),
             retry_after: Self::DEFAULT_RETRY_AFTER,
             short_job: Self::DEFAULT_SHORT_JOB,
@@ -235,7 +244,7 @@ impl Engine {
             store,
             notifier: Arc::default(),
             running: Mutex::default(),
-            room: room::Room::new(),
+            room: room::Room::new(options.max_solver_bytes),
             work: channel::Sender::new(0),
             queue_changed: Notify::new(),
             webhook_due: Notify::new(),
@@ -247,7 +256,7 @@ impl Engine {
             recovered_jobs: recovered.len(),
             options,
         });
-        observe::engine_size(inner.options.queue.max_jobs, inner.options.workers);
+        observe::engine_size(inner.options.queue.max_jobs, inner.options.workers, inner.options.max_solver_bytes);
         observe::store_state(StoreState::Healthy);
         inner.taken_back(&recovered);
         inner.hire(threads)?;
@@ -258,8 +267,9 @@ impl Engine {
     /// Admits and stores a job. A repeated request id with the same body gives the job that the first call made.
     ///
     /// # Errors
-    /// [`Error::QueueFull`] at once when too much waits, [`Error::BatchTooLarge`], [`Error::AlreadyExists`] for a taken job
-    /// id or a request id with another body, [`Error::InvalidArgument`], [`Error::Draining`].
+    /// [`Error::QueueFull`] at once when too much waits, [`Error::BatchTooLarge`], [`Error::JobTooLarge`],
+    /// [`Error::AlreadyExists`] for a taken job id or a request id with another body, [`Error::InvalidArgument`],
+    /// [`Error::Draining`].
     pub async fn submit(&self, new: NewJob) -> Result<Job, Error> {
         self.inner.clone().submit(new).await
     }
