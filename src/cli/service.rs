@@ -225,6 +225,7 @@ fn engine_options(config: &Config) -> engine::Options {
         },
         lease: Duration::from_secs(config.engine.lease_seconds),
         max_attempts: config.engine.max_attempts,
+        max_solver_bytes: config.engine.solver_bytes(),
         retention: config.store.retention.0,
         backend: config.compute.backend,
         ..engine::Options::default()
@@ -268,7 +269,7 @@ mod tests {
     fn a_configuration_of_defaults_is_the_default_of_engine_and_server() {
         let config = Config::default();
         let of = |options: engine::Options| {
-            let queue = (options.queue, options.shares, options.uploads);
+            let queue = (options.queue, options.shares, options.uploads, options.max_solver_bytes);
             (options.workers, queue, options.lease, options.max_attempts, options.retention, options.backend)
         };
         assert_eq!(of(engine_options(&config)), of(engine::Options::default()));

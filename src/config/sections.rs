@@ -299,6 +299,9 @@ pub struct Engine {
     pub drain_seconds: u64,
     /// Attempts at one job before it counts as poison and fails.
     pub max_attempts: u32,
+    /// Bytes of memory that the jobs which run at once are estimated to take together; 0: three quarters of what the
+    /// machine or container has.
+    pub max_solver_bytes: u64,
 }
 
 impl Default for Engine {
@@ -320,6 +323,7 @@ impl Default for Engine {
             // Kubernetes kills 30 s after it asks; this leaves a third of it for the rest of the exit.
             drain_seconds: 20,
             max_attempts: Options::DEFAULT_MAX_ATTEMPTS,
+            max_solver_bytes: 0,
         }
     }
 }
@@ -327,6 +331,14 @@ impl Default for Engine {
 impl Engine {
     /// Threads that one server, or one job, may be asked for: more is a slip, and the system refuses them one by one.
     pub const MOST_WORKERS: usize = 1024;
+
+    /// Bytes of memory for jobs that run at once: as configured, or a share of what there is.
+    pub fn solver_bytes(&self) -> u64 {
+        match self.max_solver_bytes {
+            0 => engine::Options::default_solver_bytes(),
+            bytes => bytes,
+        }
+    }
 
     /// Worker threads to start: as configured, or one a core.
     pub fn worker_count(&self) -> usize {

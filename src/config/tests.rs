@@ -36,7 +36,7 @@ fn nothing_given_is_the_default_and_the_example_file_says_the_same() {
 fn refusals_name_keys_that_there_are() {
     use crate::domain::Quota;
     let all: toml::Table = toml::from_str(&Config::default().to_toml().expect("TOML")).expect("a table");
-    for quota in Quota::OF_QUEUE.into_iter().chain(Quota::OF_UPLOADS) {
+    for quota in Quota::OF_QUEUE.into_iter().chain(Quota::OF_UPLOADS).chain([Quota::SolverBytes]) {
         let (section, key) = quota.key().split_once('.').expect("a section");
         assert!(all[section].get(key).is_some(), "{} is no key", quota.key());
     }

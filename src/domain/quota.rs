@@ -22,6 +22,8 @@ pub enum Quota {
     TenantUploads,
     /// Bytes of those and of the tenant's uploaded inputs.
     TenantUploadBytes,
+    /// Bytes of memory of the jobs that one server solves at once.
+    SolverBytes,
 }
 
 impl Quota {
@@ -43,6 +45,7 @@ impl Quota {
             Quota::UploadBytes => "upload_bytes",
             Quota::TenantUploads => "tenant_uploads",
             Quota::TenantUploadBytes => "tenant_upload_bytes",
+            Quota::SolverBytes => "solver_bytes",
         }
     }
 
@@ -57,6 +60,7 @@ impl Quota {
             Quota::UploadBytes => "upload.max_bytes",
             Quota::TenantUploads => "upload.tenant_uploads",
             Quota::TenantUploadBytes => "upload.tenant_bytes",
+            Quota::SolverBytes => "engine.max_solver_bytes",
         }
     }
 
@@ -67,6 +71,7 @@ impl Quota {
             Quota::Observations => "observations",
             Quota::UploadBytes | Quota::TenantUploadBytes => "bytes",
             Quota::TenantUploads => "uploads",
+            Quota::SolverBytes => "bytes of memory",
         }
     }
 }
@@ -86,6 +91,8 @@ impl fmt::Display for Oversize {
         if Quota::OF_QUEUE.contains(quota) {
             let whose = if matches!(quota, Quota::TenantJobs | Quota::TenantBytes) { " of one tenant" } else { "" };
             write!(f, "{asked} {unit}{whose} in one batch never fit: {key} is {max} here; send fewer jobs at a time")
+        } else if *quota == Quota::SolverBytes {
+            write!(f, "a job of an estimated {asked} {unit} never fits: {key} is {max} here")
         } else {
             write!(f, "an upload of {asked} {unit} never fits: {key} is {max} here")
         }

@@ -33,6 +33,9 @@ pub enum Error {
     /// The batch alone is more than may ever wait.
     #[error("{0}")]
     BatchTooLarge(Oversize),
+    /// The job alone takes more memory than jobs may that run at once.
+    #[error("{0}")]
+    JobTooLarge(Oversize),
     #[error(transparent)]
     InvalidArgument(#[from] InvalidInput),
     /// Only ended jobs can be deleted.

@@ -10,15 +10,17 @@ use std::pin::pin;
 use std::sync::Arc;
 use std::time::{Duration, SystemTime};
 
-use tokio::time::{Instant, Interval, MissedTickBehavior, interval_at, sleep, sleep_until, timeout_at};
+use tokio::time::{Instant, Interval, MissedTickBehavior, interval, interval_at, sleep, sleep_until, timeout_at};
 use tracing::{Instrument, Span};
 
 use super::Inner;
 use super::observe::{self, Attempt, AttemptLost};
+use super::room::{Place, SolverMemory};
 use super::running::Running;
 use super::worker::{Assignment, AttemptHandle, Report, Started, Verdict, Worker};
 use crate::domain::job::{Failure, Job, JobName, JobState};
 use crate::domain::{Grade, Progress, StopReason, StopToken};
+use crate::solver;
 use crate::store::{self, Claimed, Ending, Lease, Outcome, Store};
 
 /// Least time between two stored progress events of a job: twice a second is as fast as people look, and a commit
@@ -30,13 +32,16 @@ const PROGRESS_PERIOD: Duration = Duration::from_millis(500);
 const FIRST_PROGRESS: Duration = Duration::from_millis(100);
 
 /// Heartbeats within the time of a lease: two may be lost.
-const HEARTBEATS_A_LEASE: u32 = 3;
+pub(super) const HEARTBEATS_A_LEASE: u32 = 3;
 
 /// How long a late heartbeat may take: one that finds that the lease has run out asks whether it was taken over.
 const LATE_HEARTBEAT: Duration = Duration::from_secs(1);
 
 /// Pause before a write is tried again that the store could not take.
 const RETRY_PAUSE: Duration = Duration::from_millis(500);
+
+/// How often an attempt that waits for memory looks whether it is to stop: as soon as a solver would.
+const STOP_LOOK: Duration = Duration::from_millis(100);
 
 /// `Failure::reason` of a defect of ours.
 const INTERNAL: &str = "INTERNAL";
@@ -76,6 +81,10 @@ pub(super) struct JobExecution {
     /// The last progress that was stored.
     stored: Option<Progress>,
     running: Running,
+    /// Held until it is solved; `None`: not taken yet.
+    memory: Option<SolverMemory>,
+    /// Held until its end is stored, or given up.
+    _place: Place,
 }
 
 /// An attempt in a worker's hands.
@@ -100,7 +109,7 @@ fn stop_token(job: &Job, now: SystemTime) -> StopToken {
 
 impl JobExecution {
     /// Of a job that is leased: claimed, or prefetched for so long.
-    pub(super) fn new(inner: Arc<Inner>, claimed: Claimed, lease_for: Duration) -> Self {
+    pub(super) fn new(inner: Arc<Inner>, claimed: Claimed, lease_for: Duration, place: Place) -> Self {
         let Claimed { job, lease, trace_parent, queue_time } = claimed;
         let stop = stop_token(&job, inner.now());
         let running = Running::list(inner.clone(), &lease, &stop, job.state == JobState::Running);
@@ -117,6 +126,8 @@ impl JobExecution {
             lost: false,
             stored: None,
             running,
+            memory: None,
+            _place: place,
         };
         if execution.is_begun() {
             let Lease { name, attempt } = &execution.lease;
@@ -146,7 +157,11 @@ impl JobExecution {
     pub(super) async fn load(mut self, worker: &Worker) -> Result<Loaded, Finished> {
         let span = self.span.clone();
         let loading = async {
-            let input = match self.read_input().await {
+            let input = match self.take_memory().await {
+                Ok(()) => self.read_input().await,
+                Err(verdict) => Err(verdict),
+            };
+            let input = match input {
                 Ok(input) => input,
                 Err(verdict) => return Err(Finished::new(self, verdict, None)),
             };
@@ -167,6 +182,39 @@ impl JobExecution {
             Ok(Loaded { execution: self, handle })
         };
         loading.instrument(span).await
+    }
+
+    /// Takes the memory that the solver is estimated to need. Waits for jobs that have it to end; a prefetched job,
+    /// which has no heartbeats, is given up instead.
+    async fn take_memory(&mut self) -> Result<(), Verdict> {
+        let Job { view_count, track_count, observation_count, .. } = self.job;
+        let bytes = solver::estimated_bytes(view_count, track_count, observation_count);
+        let inner = self.inner.clone();
+        if !self.is_begun() {
+            self.memory = inner.room.memory_now(bytes);
+            return self.memory.as_ref().map(drop).ok_or(Verdict::Stopped(StopReason::Interrupted));
+        }
+        let mut taking = pin!(inner.room.memory(bytes));
+        let mut heartbeats = self.heartbeats();
+        let mut looks = interval(STOP_LOOK);
+        loop {
+            tokio::select! {
+                biased;
+                memory = &mut taking => {
+                    self.memory = memory;
+                    return Ok(());
+                }
+                _ = heartbeats.tick(), if !self.lost => {
+                    self.heartbeat().await;
+                }
+                () = sleep_until(self.leased_until), if !self.lost => self.lapse(),
+                _ = looks.tick() => {
+                    if let Some(reason) = self.stop.reason() {
+                        return Err(Verdict::Stopped(reason));
+                    }
+                }
+            }
+        }
     }
 
     /// Reads the input, and the cancel that may have come before the job was listed as running. A store that is out
@@ -382,7 +430,7 @@ impl Loaded {
         let begun = (&mut handle.started).await.ok()?;
         let prefetched = (execution.lease.clone(), execution.job.create_time);
         let now = execution.inner.now();
-        let claims = execution.inner.claim(Some(prefetched), now).instrument(begun.span.clone()).await;
+        let claims = execution.inner.claim(Some(prefetched), false, now).instrument(begun.span.clone()).await;
         let Some(claimed) = claims.begun else {
             execution.lapse();
             // Until then the worker is not free. Its outcome is dropped.
@@ -403,8 +451,9 @@ impl Loaded {
 }
 
 impl Finished {
-    fn new(execution: JobExecution, verdict: Verdict, latest: Option<Progress>) -> Self {
+    fn new(mut execution: JobExecution, verdict: Verdict, latest: Option<Progress>) -> Self {
         execution.running.set_solved();
+        drop(execution.memory.take());
         Self { execution, verdict, latest }
     }
 

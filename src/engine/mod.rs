@@ -9,6 +9,7 @@ mod execution;
 mod notifications;
 mod notifier;
 mod observe;
+mod room;
 mod running;
 mod slot;
 mod submit;
@@ -77,6 +78,8 @@ pub struct Options {
     pub lease: Duration,
     /// Attempts that may be lost before a job fails.
     pub max_attempts: u32,
+    /// Bytes of memory that the jobs which run at once are estimated to take together.
+    pub max_solver_bytes: u64,
     pub uploads: UploadOptions,
     /// How long ended jobs are kept, and uploaded inputs that no job has; `None`: for good.
     pub retention: Option<Duration>,
@@ -118,6 +121,12 @@ impl Options {
     pub const DEFAULT_SHORT_JOB: Duration = Duration::from_millis(100);
     /// About the time of one job.
     pub const DEFAULT_RETRY_AFTER: Duration = Duration::from_secs(3);
+
+    /// Three quarters of the memory of the machine or container, where the system tells: the rest is for calls, the
+    /// store and the program.
+    pub fn default_solver_bytes() -> u64 {
+        room::memory_bytes().map_or(u64::MAX, |bytes| bytes / 4 * 3)
+    }
 }
 
 impl Default for Options {
@@ -137,6 +146,7 @@ impl Default for Options {
             uploads: UploadOptions::default(),
             lease: Self::DEFAULT_LEASE,
             max_attempts: Self::DEFAULT_MAX_ATTEMPTS,
+            max_solver_bytes: Self::default_solver_bytes(),
             retention: Some(Self::DEFAULT_RETENTION),
             retry_after: Self::DEFAULT_RETRY_AFTER,
             short_job: Self::DEFAULT_SHORT_JOB,
@@ -191,6 +201,7 @@ struct Inner {
     notifier: Arc<notifier::Notifier>,
     /// Attempts that run in this process or are prefetched, for a cancel to reach them at once.
     running: Mutex<running::RunningAttempts>,
+    room: room::Room,
     /// Counts the reasons to look for a job to claim; slots wait for a change.
     work: channel::Sender<u64>,
     /// Wakes the task that counts the queue.
@@ -233,6 +244,7 @@ impl Engine {
             store,
             notifier: Arc::default(),
             running: Mutex::default(),
+            room: room::Room::new(options.max_solver_bytes),
             work: channel::Sender::new(0),
             queue_changed: Notify::new(),
             webhook_due: Notify::new(),
@@ -244,7 +256,7 @@ impl Engine {
             recovered_jobs: recovered.len(),
             options,
         });
-        observe::engine_size(inner.options.queue.max_jobs, inner.options.workers);
+        observe::engine_size(inner.options.queue.max_jobs, inner.options.workers, inner.options.max_solver_bytes);
         observe::store_state(StoreState::Healthy);
         inner.taken_back(&recovered);
         inner.hire(threads)?;
@@ -255,8 +267,9 @@ impl Engine {
     /// Admits and stores a job. A repeated request id with the same body gives the job that the first call made.
     ///
     /// # Errors
-    /// [`Error::QueueFull`] at once when too much waits, [`Error::BatchTooLarge`], [`Error::AlreadyExists`] for a taken job
-    /// id or a request id with another body, [`Error::InvalidArgument`], [`Error::Draining`].
+    /// [`Error::QueueFull`] at once when too much waits, [`Error::BatchTooLarge`], [`Error::JobTooLarge`],
+    /// [`Error::AlreadyExists`] for a taken job id or a request id with another body, [`Error::InvalidArgument`],
+    /// [`Error::Draining`].
     pub async fn submit(&self, new: NewJob) -> Result<Job, Error> {
         self.inner.clone().submit(new).await
     }

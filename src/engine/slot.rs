@@ -4,10 +4,12 @@ use std::pin::pin;
 use std::sync::Arc;
 use std::time::{Duration, SystemTime};
 
+use tokio::sync::watch as channel;
 use tokio::task::JoinHandle;
 use tokio::time::{Instant, sleep, sleep_until, timeout};
 
-use super::execution::{Finished, JobExecution, Loaded};
+use super::execution::{Finished, HEARTBEATS_A_LEASE, JobExecution, Loaded};
+use super::room::suspect_after;
 use super::worker::Worker;
 use super::{Inner, Options, Phase, StoreState, observe};
 use crate::store::{self, Claim, Claimed, Claims, Lease, Prefetch};
@@ -48,9 +50,9 @@ pub(super) async fn run(inner: Arc<Inner>, worker: Worker) {
                 Some((loaded, next)) => (Ok(loaded), next),
                 None => continue,
             },
-            None => {
-                let Claims { begun, prefetched: next } = inner.claim(None, inner.now()).await;
-                let Some(claimed) = begun else {
+            None => match claim(&inner, &mut phase).await {
+                Some((execution, next)) => (execution.load(&worker).await, next),
+                None if inner.phase() == Phase::Open => {
                     tokio::select! {
                         biased;
                         _ = work.changed() => {}
@@ -58,12 +60,11 @@ pub(super) async fn run(inner: Arc<Inner>, worker: Worker) {
                         () = sleep(CLAIM_POLL) => {}
                     }
                     continue;
-                };
-                let execution = JobExecution::new(inner.clone(), claimed, inner.options.lease);
-                (execution.load(&worker).await, next)
-            }
+                }
+                None => continue,
+            },
         };
-        prefetched = next.map(|next| prefetch(&inner, &worker, next));
+        prefetched = next.and_then(|next| prefetch(&inner, &worker, next));
         let finished = match loaded {
             Ok(loaded) => solve(loaded, inner.options.short_job, &mut prefetched).await,
             Err(finished) => finished,
@@ -87,15 +88,60 @@ pub(super) async fn run(inner: Arc<Inner>, worker: Worker) {
     }
 }
 
+/// Claims the next job, and the one after it. Waits as long as a suspect runs in this process, or is about to. `None`:
+/// there is none to begin, or the engine drains.
+async fn claim(inner: &Arc<Inner>, phase: &mut channel::Receiver<Phase>) -> Option<(JobExecution, Option<Claimed>)> {
+    let place = tokio::select! {
+        biased;
+        _ = phase.changed() => return None,
+        place = inner.room.place() => place?,
+    };
+    let claims = inner.claim(None, false, inner.now()).await;
+    match (claims.begun, claims.prefetched) {
+        (Some(claimed), next) => Some((JobExecution::new(inner.clone(), claimed, inner.options.lease, place), next)),
+        (None, Some(suspect)) => {
+            drop(place);
+            Some((begin_suspect(inner, suspect, phase).await?, None))
+        }
+        (None, None) => None,
+    }
+}
+
+/// Begins a suspect once nothing else runs in this process. Until then it is queued and leased: an attempt that waits
+/// would be lost with those that run. `None`: it is another's by now, or nobody's, or the engine drains.
+async fn begin_suspect(
+    inner: &Arc<Inner>,
+    suspect: Claimed,
+    phase: &mut channel::Receiver<Phase>,
+) -> Option<JobExecution> {
+    tracing::warn!(job = %suspect.job.name, "it lost attempts before and runs alone: this server begins nothing else");
+    let begin = (suspect.lease, suspect.job.create_time);
+    let lease = inner.options.lease;
+    let mut alone = pin!(inner.room.all_places());
+    loop {
+        tokio::select! {
+            biased;
+            _ = phase.changed() => return None,
+            place = &mut alone => {
+                let claimed = inner.claim(Some(begin), true, inner.now()).await.begun?;
+                return Some(JobExecution::new(inner.clone(), claimed, lease, place?));
+            }
+            () = sleep(lease / HEARTBEATS_A_LEASE) => {
+                inner.claim(Some(begin.clone()), false, inner.now()).await.prefetched?;
+            }
+        }
+    }
+}
+
 /// A job on its way into the worker's hands. Dropped, it is not begun, and its lease lapses.
 type Prefetched = Task<Option<Loaded>>;
 
-/// Loads a prefetched job.
-fn prefetch(inner: &Arc<Inner>, worker: &Worker, claimed: Claimed) -> Prefetched {
-    let execution = JobExecution::new(inner.clone(), claimed, inner.prefetch_lease());
+/// Loads a prefetched job, unless a suspect waits for those that run.
+fn prefetch(inner: &Arc<Inner>, worker: &Worker, claimed: Claimed) -> Option<Prefetched> {
+    let execution = JobExecution::new(inner.clone(), claimed, inner.prefetch_lease(), inner.room.place_now()?);
     let worker = worker.clone();
     // One that cannot be read is told of when it is claimed.
-    Task(tokio::spawn(async move { execution.load(&worker).await.ok() }))
+    Some(Task(tokio::spawn(async move { execution.load(&worker).await.ok() })))
 }
 
 /// Begins with a prefetched job; `None` where it is not to be had any more.
@@ -189,17 +235,19 @@ async fn due(inner: &Inner, counted: Instant) {
 
 impl Inner {
     /// Begins with the next job in the queue, or with one that was prefetched, and prefetches the one after it. Nothing
-    /// where there is none to begin, or the store does not answer.
-    pub(super) async fn claim(&self, begin: Option<(Lease, SystemTime)>, now: SystemTime) -> Claims {
-        let Options { worker_name, lease, shares, short_job, .. } = &self.options;
+    /// where there is none to begin, or the store does not answer. `alone`: nothing else runs in this process, nor is
+    /// anything to be prefetched; else a suspect is only leased.
+    pub(super) async fn claim(&self, begin: Option<(Lease, SystemTime)>, alone: bool, now: SystemTime) -> Claims {
+        let Options { worker_name, lease, shares, short_job, max_attempts, .. } = &self.options;
         let terms = Prefetch { lease_for: self.prefetch_lease(), max_observations: MAX_PREFETCH_OBSERVATIONS };
         let claim = Claim {
             worker: worker_name.clone(),
             lease_for: *lease,
             begin,
-            prefetch: (!short_job.is_zero()).then_some(terms),
+            prefetch: (!alone && !short_job.is_zero()).then_some(terms),
             shares: shares.clone(),
             solved: if shares.max_running.is_some() { self.solved() } else { Vec::new() },
+            suspect_after: (!alone).then(|| suspect_after(*max_attempts)),
         };
         let claims = self.store.claim(&claim, now).await.unwrap_or_else(|error| {
             self.not_claimed(&error);

@@ -9,7 +9,8 @@ use sha2::{Digest, Sha256};
 use super::{Error, Inner, Phase, WebhookOptions, finished, observe, webhooks};
 use crate::domain::error::{Violation, Violations, quoted};
 use crate::domain::job::{Job, JobName};
-use crate::domain::{Backend, Input, InputName, SolveSettings};
+use crate::domain::{Backend, Input, InputName, Oversize, Quota, SolveSettings};
+use crate::solver;
 use crate::store::{self, NewRecord, Request, StoredInput, payload};
 
 /// Longest request id: a UUID with room for a prefix.
@@ -211,6 +212,12 @@ impl Inner {
         } else {
             finished(tokio::task::spawn_blocking(encode)).await?
         };
+        let max = self.options.max_solver_bytes;
+        let asked = |new: &NewRecord| solver::estimated_bytes(new.view_count, new.track_count, new.observation_count);
+        if let Some(asked) = records.iter().map(asked).find(|asked| *asked > max) {
+            observe::refused(observe::Refusal::JobTooLarge);
+            return Err(Error::JobTooLarge(Oversize { quota: Quota::SolverBytes, asked, max }));
+        }
         // On its own task: a caller that goes away must not leave a stored job untold.
         finished(tokio::spawn(async move { self.store_jobs(records, now).await })).await
     }

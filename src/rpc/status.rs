@@ -23,6 +23,7 @@
 //! | `OUT_OF_RANGE` | `MESSAGE_TOO_LARGE` | a message above `Capabilities.input_limits.max_message_bytes`, packed or not |
 //! | `RESOURCE_EXHAUSTED` | `QUEUE_FULL` | admission refused, by the queue's bound of `metadata["bound"]`: `jobs`, `bytes`, `observations`, `tenant_jobs` or `tenant_bytes`; `RetryInfo` says when to come back |
 //! | `INVALID_ARGUMENT` | `BATCH_TOO_LARGE` | the batch alone is more than the queue's bound of `metadata["bound"]` ever allows, named as for `QUEUE_FULL`; `metadata` has `key`, `asked` and `max` too |
+//! | `INVALID_ARGUMENT` | `JOB_TOO_LARGE` | the solver would take more memory for the job than `engine.max_solver_bytes`; `metadata` as for `BATCH_TOO_LARGE` |
 //! | `RESOURCE_EXHAUSTED` | `MEMORY` | the calls under way hold as many bytes as they may together; `RetryInfo`. Nothing was stored but the chunks of an upload |
 //! | `RESOURCE_EXHAUSTED` | `RATE_LIMITED` | more calls of the key, or more new jobs of the tenant, than the rate of `metadata["key"]` allows; `RetryInfo` says after what time this one would pass |
 //! | `RESOURCE_EXHAUSTED` | `STORE_FULL` | the server's disk is full and nothing was stored; `RetryInfo`. What was acknowledged before is there |
@@ -263,6 +264,7 @@ pub fn from_engine(error: engine::Error) -> Status {
         }
         engine::Error::UploadTooLarge(oversize) => too_large("UPLOAD_TOO_LARGE", "start.size_bytes", &oversize),
         engine::Error::BatchTooLarge(oversize) => too_large("BATCH_TOO_LARGE", "requests", &oversize),
+        engine::Error::JobTooLarge(oversize) => too_large("JOB_TOO_LARGE", "job", &oversize),
         engine::Error::AlreadyExists(taken) => {
             let reason = match taken {
                 TakenId::Job(_) => "JOB_ID_TAKEN",
@@ -358,7 +360,8 @@ mod tests {
         let of_batch = Quota::OF_QUEUE.map(|quota| (quota, engine::Error::BatchTooLarge(oversize(quota)), "requests"));
         let of_upload = [Quota::UploadBytes, Quota::TenantUploadBytes]
             .map(|quota| (quota, engine::Error::UploadTooLarge(oversize(quota)), "start.size_bytes"));
-        for (quota, error, field) in of_batch.into_iter().chain(of_upload) {
+        let of_job = (Quota::SolverBytes, engine::Error::JobTooLarge(oversize(Quota::SolverBytes)), "job");
+        for (quota, error, field) in of_batch.into_iter().chain(of_upload).chain([of_job]) {
             let status = from_engine(error);
             assert_eq!(status.code(), Code::InvalidArgument);
             assert!(status.get_details_retry_info().is_none(), "{status:?}");

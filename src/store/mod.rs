@@ -172,6 +172,9 @@ pub trait Store: Send + Sync + 'static {
     /// The claim may also prefetch: it leases the job after it, which stays queued until a later claim begins it. Other
     /// claims pass over a prefetched job until that lease expires, but for those that find no other job. Nothing need
     /// be given back: a prefetched job that is not begun in time is any worker's, and no attempt was made.
+    ///
+    /// A suspect ([`Claim::suspect_after`]) is leased as long as a job that is begun, and not begun; a claim that is to
+    /// begin it extends that lease.
     async fn claim(&self, claim: &Claim, now: SystemTime) -> Result<Claims, Error>;
 
     /// The encoded input of a job, and whether its cancel has been asked for.

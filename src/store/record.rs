@@ -277,10 +277,13 @@ pub struct Claim {
     /// Leases of jobs that are solved and whose end is not stored yet: they do not count for the bound on running jobs,
     /// for whose place this claim is made.
     pub solved: Vec<Lease>,
+    /// Lost attempts from which on a job is a suspect, which is leased, not begun. `None`: nothing else runs in the
+    /// process, so that a suspect may be begun.
+    pub suspect_after: Option<u32>,
 }
 
 impl Claim {
-    /// Of the next job alone, where all tenants have equal shares.
+    /// Of the next job alone, where all tenants have equal shares, by a process in which nothing else runs.
     pub fn one(worker: &str, lease_for: Duration) -> Self {
         Self {
             worker: worker.into(),
@@ -289,6 +292,7 @@ impl Claim {
             prefetch: None,
             shares: Arc::default(),
             solved: Vec::new(),
+            suspect_after: None,
         }
     }
 }
@@ -307,7 +311,8 @@ pub struct Prefetch {
 pub struct Claims {
     /// It is running.
     pub begun: Option<Claimed>,
-    /// It is queued. Its lease is that of the attempt which a later claim is to begin.
+    /// It is queued. Its lease is that of the attempt which a later claim is to begin. Where none is begun, it is a
+    /// suspect.
     pub prefetched: Option<Claimed>,
 }
 

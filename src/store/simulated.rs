@@ -34,6 +34,8 @@ pub(crate) enum Bug {
     LateWrite,
     /// A reader of events passes one over now and then.
     MissedEvent,
+    /// Jobs that lost attempts run among others.
+    Crowd,
 }
 
 /// What happens to the operations of one server from now on.
@@ -324,10 +326,14 @@ impl Connection for SimulatedConnection {
 
     async fn rows(&mut self, statement: Statement) -> Result<Vec<WrittenRow>, Error> {
         let bug = self.bug;
-        let is_claim = bug == Some(Bug::DoubleClaim) && statement.sql().contains("ORDER BY priority");
-        let statement = match is_claim {
-            true => statement.replaced("state = 'QUEUED'", "state IN ('QUEUED', 'RUNNING')"),
-            false => statement,
+        let statement = match bug {
+            Some(Bug::DoubleClaim) if statement.sql().contains("ORDER BY priority") => {
+                statement.replaced("state = 'QUEUED'", "state IN ('QUEUED', 'RUNNING')")
+            }
+            Some(Bug::Crowd) if statement.sql().contains("state = 'QUEUED'") => {
+                statement.replaced("attempt, lost_attempts,", "attempt, 0 AS lost_attempts,")
+            }
+            _ => statement,
         };
         let reads_events = statement.sql().contains("FROM events");
         let mut rows = self.inner.rows(statement).await?;

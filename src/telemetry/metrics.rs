@@ -155,10 +155,12 @@ pub fn queue_paused(paused: bool) {
     gauge!(QUEUE_PAUSED.name).set(f64::from(u8::from(paused)));
 }
 
-/// Tells how many jobs may wait and how many threads work; once, at the start of the engine.
-pub fn engine_size(queue_capacity: u64, workers: usize) {
+/// Tells how many jobs may wait, how many threads work, and how many bytes their jobs may take together; once, at the
+/// start of the engine.
+pub fn engine_size(queue_capacity: u64, workers: usize, solver_bytes: u64) {
     gauge!(QUEUE_CAPACITY.name).set(queue_capacity as f64);
     gauge!(WORKERS.name).set(workers as f64);
+    gauge!(SOLVER_CAPACITY.name).set(solver_bytes as f64);
 }
 
 /// Tells whether the store answers.
@@ -260,6 +262,11 @@ pub fn attempt_lost(reason: AttemptLost) {
 /// A worker is busy until the guard is dropped.
 pub fn busy_worker() -> Held {
     Held::new(gauge!(WORKERS_BUSY.name))
+}
+
+/// A job takes so many bytes until the guard is dropped.
+pub fn solver_bytes(bytes: u64) -> Held {
+    Held::by(gauge!(SOLVER_BYTES.name), bytes as f64)
 }
 
 /// A stream follows a job until the guard is dropped.

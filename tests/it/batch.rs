@@ -55,6 +55,22 @@ fn several_inputs_are_several_jobs_or_none() {
 }
 
 #[test]
+fn a_job_that_takes_too_much_memory_is_bad_input_and_names_the_key() {
+    let directory = tempfile::tempdir().expect("a temporary directory");
+    let bounds = [("SCPSFM_ENGINE__MAX_SOLVER_BYTES", "1000000")];
+    let server = Serving::start_with(&directory.path().join("data"), &bounds, std::process::Stdio::null());
+    let refused = run(["submit", &table(directory.path(), 3, ""), "--server", &server.grpc]);
+    assert_eq!(refused.code, Some(65), "{refused:?}");
+    assert!(refused.stderr.contains("never fits: engine.max_solver_bytes is 1000000 here"), "{refused:?}");
+    assert!(!refused.stderr.contains("try again"), "{refused:?}");
+    let page = Page::parse(&server.page("/metrics"));
+    let of_job = "scpsfm_admission_refusals_total{reason=\"JOB_TOO_LARGE\",bound=\"solver_bytes\"}";
+    assert_eq!((page.value(of_job), page.sum("scpsfm_admission_refusals_total")), (1.0, 1.0));
+    let memory = (page.value("scpsfm_solver_capacity_bytes"), page.value("scpsfm_solver_bytes"));
+    assert_eq!(memory, (1_000_000.0, 0.0));
+}
+
+#[test]
 fn what_never_fits_is_bad_input_and_names_the_key() {
     let directory = tempfile::tempdir().expect("a temporary directory");
     let bounds = [("SCPSFM_ENGINE__QUEUE_CAPACITY", "1"), ("SCPSFM_UPLOAD__TENANT_BYTES", "20")];

@@ -178,7 +178,7 @@ pub(super) fn rate_limit_wait(status: &Status) -> Option<Duration> {
 
 /// Whether what was sent is more by itself than the server has room for.
 fn is_too_large(status: &Status) -> bool {
-    matches!(reason(status).as_deref(), Some("BATCH_TOO_LARGE" | "UPLOAD_TOO_LARGE"))
+    matches!(reason(status).as_deref(), Some("BATCH_TOO_LARGE" | "UPLOAD_TOO_LARGE" | "JOB_TOO_LARGE"))
 }
 
 /// Whether the same call may fare better soon: the connection broke, or the server is going down.

@@ -2,6 +2,7 @@
 
 mod admission;
 mod lifecycle;
+mod memory;
 mod prefetch;
 mod sharing;
 mod simulation;

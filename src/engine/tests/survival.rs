@@ -192,6 +192,92 @@ fn a_job_that_takes_its_process_down_each_time_fails() {
     });
 }
 
+#[test]
+fn a_job_that_takes_its_process_down_each_time_fails_and_its_neighbour_does_not() {
+    let directory = tempfile::tempdir().expect("a temporary directory");
+    let solver = Arc::new(FakeSolver::default());
+    let mut names = Vec::new();
+    // Both begin twice. The third time the older one begins alone: with a second worker either might.
+    for (count, begun) in [(2, 2), (2, 4), (1, 5)] {
+        let runtime = Runtime::new().expect("a runtime");
+        runtime.block_on(async {
+            let (engine, _) = start(workers(count), &directory, &solver).await;
+            if names.is_empty() {
+                for _ in 0..2 {
+                    names.push(engine.submit(new_job(Behavior::Wait)).await.expect("admitted").name);
+                }
+            }
+            solver.until_waiting(begun).await;
+        });
+        runtime.shutdown_background();
+    }
+    Runtime::new().expect("a runtime").block_on(async {
+        let (engine, _) = start(workers(2), &directory, &solver).await;
+        let poison = engine.job(&names[0]).await.expect("exists");
+        assert_eq!((poison.state, poison.attempt), (JobState::Failed, 3));
+        solver.release();
+        let neighbour = ended(&engine, &names[1]).await;
+        assert_eq!((neighbour.state, neighbour.attempt), (JobState::Succeeded, 3));
+    });
+}
+
+#[tokio::test]
+async fn a_job_that_lost_attempts_waits_until_it_is_alone_and_others_wait_for_it() {
+    let test = TestEngine::start(workers(2)).await;
+    let running = test.submit(Behavior::Wait).await;
+    test.solver.until_waiting(1).await;
+    test.engine.pause().await.expect("pauses");
+    let suspect = NewJob { priority: 9, ..new_job(Behavior::Wait) };
+    let suspect = test.engine.submit(suspect).await.expect("admitted").name;
+    test.store.execute("UPDATE jobs SET lost_attempts = 2 WHERE priority = 9").await;
+    let other = test.submit(Behavior::Succeed).await;
+    test.engine.resume().await.expect("resumes");
+    // Nobody gets a place once the suspect waits for all of them.
+    eventually(|| async { test.engine.inner.room.place_now().is_none().then_some(()) }).await;
+    for name in [&suspect, &other] {
+        let job = test.engine.job(name).await.expect("exists");
+        assert_eq!((job.state, job.attempt), (JobState::Queued, 0), "no attempt waits");
+    }
+
+    test.engine.cancel(&running).await.expect("exists");
+    test.solver.until_waiting(2).await;
+    assert_eq!(test.engine.job(&suspect).await.expect("exists").state, JobState::Running);
+    assert_eq!(test.engine.job(&other).await.expect("exists").state, JobState::Queued);
+    assert_eq!(locked(&test.engine.inner.running).len(), 1);
+    test.solver.release();
+    for (name, call) in [(&suspect, 2), (&other, 3)] {
+        assert_eq!(test.ended(name).await.state, JobState::Succeeded);
+        assert_eq!(call_of(&test.engine, name).await, call);
+    }
+}
+
+#[tokio::test]
+async fn a_suspect_that_waits_is_cancelled_and_left_by_a_drain_as_any_job_that_waits() {
+    for drains in [false, true] {
+        // Its lease is renewed after a third of that, which is when a cancel is noticed.
+        let test = TestEngine::start(Options { lease: Duration::from_secs(3), ..workers(2) }).await;
+        let running = test.submit(Behavior::Wait).await;
+        test.solver.until_waiting(1).await;
+        test.engine.pause().await.expect("pauses");
+        let suspect = NewJob { priority: 9, ..new_job(Behavior::Wait) };
+        let suspect = test.engine.submit(suspect).await.expect("admitted").name;
+        test.store.execute("UPDATE jobs SET lost_attempts = 2 WHERE priority = 9").await;
+        test.engine.resume().await.expect("resumes");
+        eventually(|| async { test.engine.inner.room.place_now().is_none().then_some(()) }).await;
+        if drains {
+            test.engine.drain(Duration::ZERO).await;
+            let job = test.engine.job(&suspect).await.expect("exists");
+            assert_eq!((job.state, job.attempt), (JobState::Queued, 0));
+        } else {
+            test.engine.cancel(&suspect).await.expect("exists");
+            let other = test.submit(Behavior::Succeed).await;
+            assert_eq!(test.ended(&other).await.state, JobState::Succeeded, "beside the one that runs");
+            assert_eq!(test.ended(&suspect).await.attempt, 0);
+            assert_eq!(test.engine.job(&running).await.expect("exists").state, JobState::Running);
+        }
+    }
+}
+
 #[tokio::test]
 async fn a_worker_whose_lease_was_taken_over_changes_nothing() {
     // Heartbeats far apart: the first worker learns of its loss only when it wants to write its result.

@@ -127,6 +127,48 @@ pub(in crate::store) async fn large_jobs_and_late_ones_are_not_prefetched(store:
     assert_eq!(begun.map(|claimed| claimed.lease), Some(last.lease), "kept long, and still there");
 }
 
+pub(in crate::store) async fn a_suspect_is_begun_only_where_nothing_else_runs(store: &dyn Store) {
+    let busy = Claim { suspect_after: Some(2), ..Claim::one("worker", LEASE) };
+    let name = create(store, record("suspect"), 0).await.name;
+    for seconds in [100, 200] {
+        assert!(store.claim(&busy, time(seconds)).await.expect("claims").begun.is_some(), "no suspect yet");
+        store.sweep(time(seconds + LEASE.as_secs()), MAX_ATTEMPTS).await.expect("sweeps");
+    }
+    let told_before = story(store, &name).await;
+    create(store, NewRecord { priority: 1, ..record("first") }, 300).await;
+    create(store, record("last"), 300).await;
+    let prefetch = Some(Prefetch { lease_for: KEPT, max_observations: u32::MAX });
+    let claims = store.claim(&Claim { prefetch, ..busy.clone() }, time(300)).await.expect("claims");
+    assert_eq!(claims.begun.map(|begun| begun.lease.name), Some(record("first").name));
+    assert_eq!(claims.prefetched, None, "a suspect is not prefetched");
+
+    // It is leased, and stays so as long as it is asked for.
+    let claims = store.claim(&busy, time(300)).await.expect("claims");
+    let suspect = claims.prefetched.expect("it is next");
+    assert_eq!((claims.begun, suspect.job.state), (None, JobState::Queued));
+    assert_eq!(suspect.lease, Lease { name: name.clone(), attempt: 3 });
+    let other = Claim { worker: "other".into(), ..busy.clone() };
+    let last = store.claim(&other, time(301)).await.expect("claims").begun.expect("a job");
+    assert_eq!(last.lease.name, record("last").name, "others pass over it");
+    let begin = Some((suspect.lease.clone(), suspect.job.create_time));
+    let renewal = Claim { begin, ..busy };
+    let renewed = Claims { begun: None, prefetched: Some(suspect.clone()) };
+    assert_eq!(store.claim(&renewal, time(320)).await, Ok(renewed.clone()));
+    assert_eq!(store.claim(&other, time(349)).await, Ok(Claims::default()), "also one that finds no other job");
+
+    // Where its holder is gone, it is another's.
+    assert_eq!(store.claim(&other, time(350)).await, Ok(renewed));
+    assert_eq!(store.claim(&renewal, time(351)).await, Ok(Claims::default()));
+    assert_eq!(story(store, &name).await, told_before, "nothing is told of all that");
+    let alone = Claim { worker: "other".into(), suspect_after: None, ..renewal };
+    let begun = store.claim(&alone, time(352)).await.expect("claims").begun.expect("it is its lease");
+    assert_eq!((&begun.lease, begun.job.state), (&suspect.lease, JobState::Running));
+    let lost = store.sweep(time(352 + LEASE.as_secs()), MAX_ATTEMPTS).await.expect("sweeps").lost;
+    let states: Vec<_> = lost.iter().map(|job| (&*job.name.job, job.state)).collect();
+    let expected = [("suspect", JobState::Failed), ("first", JobState::Queued), ("last", JobState::Queued)];
+    assert_eq!(states, expected);
+}
+
 pub(in crate::store) async fn a_lease_that_was_taken_over_writes_nothing(store: &dyn Store) {
     let name = create(store, record("a"), 0).await.name;
     let old = claim(store, 0).await.lease;

@@ -35,6 +35,7 @@ macro_rules! store_contract {
             leases::a_prefetched_job_waits_until_it_is_begun,
             leases::a_prefetched_job_is_begun_by_whoever_comes_first,
             leases::large_jobs_and_late_ones_are_not_prefetched,
+            leases::a_suspect_is_begun_only_where_nothing_else_runs,
             leases::a_lease_that_was_taken_over_writes_nothing,
             leases::a_success_stores_its_result_then_its_state,
             leases::progress_is_an_event_and_stands_in_the_job,

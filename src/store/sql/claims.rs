@@ -2,6 +2,9 @@
 //!
 //! A prefetched job is queued and has a lease. It is begun by whoever comes first: the worker that has it in its hands,
 //! one that finds no other job, or anyone once the lease has expired.
+//!
+//! A suspect, which lost attempts before, is begun only by a process in which nothing else runs. Other claims lease it
+//! as a prefetched job, so that it stays with one process until that is at rest, and extend this lease.
 
 use std::time::SystemTime;
 
@@ -34,12 +37,16 @@ pub(super) async fn claim<C: Connection>(
     }
     let job = match &claim.begin {
         Some((lease, created)) => prefetched(connection, claim, lease, *created, now, lease_now).await?,
-        None => match next(connection, claim, u32::MAX, now, lease_now).await? {
+        None => match next(connection, claim, |_| true, now, lease_now).await? {
             Some(job) => Some(job),
-            None => prefetched_by_any(connection, now, lease_now).await?,
+            None => prefetched_by_any(connection, claim, now, lease_now).await?,
         },
     };
     let Some(job) = job else { return Ok(Claims::default()) };
+    if is_suspect(claim, &job) {
+        let suspect = lease(connection, claim, &job, lease_now + claim.lease_for).await?;
+        return Ok(Claims { begun: None, prefetched: Some(suspect) });
+    }
     let begun = begin(connection, claim, &job, now, lease_now).await?;
     let prefetched = match claim.prefetch {
         Some(terms) => prefetch(connection, claim, terms, now, lease_now).await?,
@@ -48,12 +55,17 @@ pub(super) async fn claim<C: Connection>(
     Ok(Claims { begun: Some(begun), prefetched })
 }
 
-/// The job whose turn it is among those that nobody has a lease on, counted for its tenant; none where it has more
-/// observations than that.
+/// Whether a job is to be begun once nothing else runs in the process.
+fn is_suspect(claim: &Claim, job: &LockedJob) -> bool {
+    claim.suspect_after.is_some_and(|lost| job.lost_attempts >= lost)
+}
+
+/// The job whose turn it is among those that nobody has a lease on, counted for its tenant; none where it is not
+/// `wanted`.
 async fn next<C: Connection>(
     connection: &mut C,
     claim: &Claim,
-    max_observations: u32,
+    wanted: impl Fn(&LockedJob) -> bool,
     now: SystemTime,
     lease_now: SystemTime,
 ) -> Result<Option<LockedJob>, Error> {
@@ -68,7 +80,7 @@ async fn next<C: Connection>(
         .then(C::SKIP_LOCKED);
         if let Some(row) = connection.optional_row(first).await? {
             let job = LockedJob::from_row(&row)?;
-            if job.observation_count > max_observations {
+            if !wanted(&job) {
                 break;
             }
             connection.execute(fairness::count::<C>(&claim.shares, &tenant)).await?;
@@ -106,19 +118,21 @@ async fn prefetched<C: Connection>(
 }
 
 /// A job that any worker has prefetched: it would wait for that worker, and this one is idle. There are as many as
-/// workers at most, and their tenants' turns have come.
+/// workers at most, and their tenants' turns have come. A suspect stays with the process that waits to be at rest.
 async fn prefetched_by_any<C: Connection>(
     connection: &mut C,
+    claim: &Claim,
     now: SystemTime,
     lease_now: SystemTime,
 ) -> Result<Option<LockedJob>, Error> {
     let first = Statement::new(select_locked_job!(
         "WHERE state = 'QUEUED' AND lease_expires IS NOT NULL AND lease_expires > $1 \
-         AND (deadline IS NULL OR deadline > $2) AND (SELECT pause_time FROM queue) IS NULL \
+         AND (deadline IS NULL OR deadline > $2) AND lost_attempts < $3 AND (SELECT pause_time FROM queue) IS NULL \
          ORDER BY priority DESC, create_time, id LIMIT 1"
     ))
     .bind(micros(lease_now))
     .bind(micros(now))
+    .bind(claim.suspect_after.map_or(i64::MAX, i64::from))
     .then(C::SKIP_LOCKED);
     connection.optional_row(first).await?.as_ref().map(LockedJob::from_row).transpose()
 }
@@ -163,12 +177,23 @@ async fn prefetch<C: Connection>(
     now: SystemTime,
     lease_now: SystemTime,
 ) -> Result<Option<Claimed>, Error> {
-    let Some(job) = next(connection, claim, terms.max_observations, now, lease_now).await? else { return Ok(None) };
+    let wanted = |job: &LockedJob| job.observation_count <= terms.max_observations && !is_suspect(claim, job);
+    let Some(job) = next(connection, claim, wanted, now, lease_now).await? else { return Ok(None) };
+    lease(connection, claim, &job, lease_now + terms.lease_for).await.map(Some)
+}
+
+/// Leases a queued job that is not begun.
+async fn lease<C: Connection>(
+    connection: &mut C,
+    claim: &Claim,
+    job: &LockedJob,
+    expires: SystemTime,
+) -> Result<Claimed, Error> {
     let lease = Statement::new(returning_job!("UPDATE jobs SET lease_worker = $1, lease_expires = $2 WHERE id = $3"))
         .bind(&claim.worker)
-        .bind(micros(lease_now + terms.lease_for))
+        .bind(micros(expires))
         .bind(job.id);
-    claimed(&connection.row(lease).await?, 1).map(Some)
+    claimed(&connection.row(lease).await?, 1)
 }
 
 /// A job with its lease, from a row of all its columns. `earlier`: attempts that are to be begun before the lease's.

@@ -79,6 +79,18 @@ pub const WORKERS: Metric =
     Metric { name: "scpsfm_workers", kind: Kind::Gauge, labels: &[], help: "Worker threads of this process." };
 pub const WORKERS_BUSY: Metric =
     Metric { name: "scpsfm_workers_busy", kind: Kind::Gauge, labels: &[], help: "Worker threads that run a job." };
+pub const SOLVER_BYTES: Metric = Metric {
+    name: "scpsfm_solver_bytes",
+    kind: Kind::Gauge,
+    labels: &[],
+    help: "Bytes of memory that the jobs in this process are estimated to take: those that run and those that are to run next.",
+};
+pub const SOLVER_CAPACITY: Metric = Metric {
+    name: "scpsfm_solver_capacity_bytes",
+    kind: Kind::Gauge,
+    labels: &[],
+    help: "Bytes that they may take together; a job that would take more waits for others to end.",
+};
 pub const JOBS: Metric = Metric {
     name: "scpsfm_jobs_total",
     kind: Kind::Counter,
@@ -143,7 +155,7 @@ pub const REFUSALS: Metric = Metric {
     name: "scpsfm_admission_refusals_total",
     kind: Kind::Counter,
     labels: &["reason", "bound"],
-    help: "Jobs refused before anything was stored, by reason; of QUEUE_FULL and BATCH_TOO_LARGE, by the bound that was hit. MEMORY and RATE_LIMITED count calls of every kind.",
+    help: "Jobs refused before anything was stored, by reason; of QUEUE_FULL, BATCH_TOO_LARGE and JOB_TOO_LARGE, by the bound that was hit. MEMORY and RATE_LIMITED count calls of every kind.",
 };
 pub const UPLOADED_BYTES: Metric = Metric {
     name: "scpsfm_uploaded_bytes_total",
@@ -332,6 +344,8 @@ pub const ALL: &[Metric] = &[
     QUEUE_WAIT,
     WORKERS,
     WORKERS_BUSY,
+    SOLVER_BYTES,
+    SOLVER_CAPACITY,
     JOBS,
     JOBS_CREATED,
     JOBS_DELETED,

@@ -6,21 +6,26 @@ use metrics::{counter, gauge, histogram};
 
 use super::catalogue::{RPC_DURATION, RPC_IN_FLIGHT, RPC_REQUESTS, STORE_DURATION};
 
-/// Holds a gauge one higher for as long as it lives, whatever way its scope is left.
+/// Holds a gauge higher for as long as it lives, whatever way its scope is left.
 #[must_use = "the gauge falls when this is dropped"]
 #[derive(Debug)]
-pub struct Held(metrics::Gauge);
+pub struct Held(metrics::Gauge, f64);
 
 impl Held {
+    /// By one.
     pub(super) fn new(gauge: metrics::Gauge) -> Self {
-        gauge.increment(1.0);
-        Self(gauge)
+        Self::by(gauge, 1.0)
+    }
+
+    pub(super) fn by(gauge: metrics::Gauge, amount: f64) -> Self {
+        gauge.increment(amount);
+        Self(gauge, amount)
     }
 }
 
 impl Drop for Held {
     fn drop(&mut self) {
-        self.0.decrement(1.0);
+        self.0.decrement(self.1);
     }
 }
 

@@ -16,6 +16,8 @@ pub enum Refusal {
     Invalid,
     /// The input is above the advertised limits.
     TooLarge,
+    /// The job alone takes more memory than those that run may take together.
+    JobTooLarge,
     /// The server is draining.
     Draining,
     /// The calls under way hold as many bytes as they may.
@@ -58,7 +60,13 @@ impl Refusal {
         let by_bound =
             Quota::OF_QUEUE.into_iter().flat_map(|quota| [Refusal::QueueFull(quota), Refusal::BatchTooLarge(quota)]);
         let by_rate = RateBound::ALL.into_iter().map(Refusal::RateLimited);
-        by_bound.chain(by_rate).chain([Refusal::Invalid, Refusal::TooLarge, Refusal::Draining, Refusal::Memory])
+        by_bound.chain(by_rate).chain([
+            Refusal::Invalid,
+            Refusal::TooLarge,
+            Refusal::JobTooLarge,
+            Refusal::Draining,
+            Refusal::Memory,
+        ])
     }
 
     pub(super) fn reason(self) -> &'static str {
@@ -67,6 +75,7 @@ impl Refusal {
             Refusal::BatchTooLarge(_) => "BATCH_TOO_LARGE",
             Refusal::Invalid => "INVALID",
             Refusal::TooLarge => "TOO_LARGE",
+            Refusal::JobTooLarge => "JOB_TOO_LARGE",
             Refusal::Draining => "DRAINING",
             Refusal::Memory => "MEMORY",
             Refusal::RateLimited(_) => "RATE_LIMITED",
@@ -78,6 +87,7 @@ impl Refusal {
         match self {
             Refusal::QueueFull(quota) | Refusal::BatchTooLarge(quota) => quota.name(),
             Refusal::RateLimited(bound) => bound.name(),
+            Refusal::JobTooLarge => Quota::SolverBytes.name(),
             Refusal::Invalid | Refusal::TooLarge | Refusal::Draining | Refusal::Memory => NONE,
         }
     }

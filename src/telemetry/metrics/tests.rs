@@ -117,6 +117,8 @@ fn what_is_known_beforehand_is_zero_before_the_first_job() {
         "scpsfm_jobs_deleted_total{reason=\"RETENTION\"}",
         "scpsfm_http_refused_total{reason=\"HOST_REFUSED\"}",
         "scpsfm_admission_refusals_total{reason=\"DRAINING\",bound=\"NONE\"}",
+        "scpsfm_admission_refusals_total{reason=\"JOB_TOO_LARGE\",bound=\"solver_bytes\"}",
+        "scpsfm_solver_bytes",
         "scpsfm_admission_refusals_total{reason=\"RATE_LIMITED\",bound=\"calls\"}",
         "scpsfm_admission_refusals_total{reason=\"RATE_LIMITED\",bound=\"jobs\"}",
         "scpsfm_job_duration_seconds_count{state=\"SUCCEEDED\"}",

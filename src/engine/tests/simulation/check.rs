@@ -34,8 +34,8 @@ pub(super) fn is_paused(cluster: &Cluster) -> bool {
     cluster.numbers("SELECT COUNT(*) AS number FROM queue WHERE pause_time IS NOT NULL")[0] > 0
 }
 
-/// What is stored once everything has come to rest.
-pub(super) fn at_the_end(cluster: &Cluster, clients: &Clients) -> Result<(), String> {
+/// What is stored once everything has come to rest. `is_disturbed`: whether servers had more to bear than their jobs.
+pub(super) fn at_the_end(cluster: &Cluster, clients: &Clients, is_disturbed: bool) -> Result<(), String> {
     let store = cluster.connect::<true>(0, beginning());
     let runtime = Builder::new_current_thread().enable_time().start_paused(true).build().expect("a runtime");
     runtime.block_on(async {
@@ -49,7 +49,7 @@ pub(super) fn at_the_end(cluster: &Cluster, clients: &Clients) -> Result<(), Str
             };
             let events = store.events_after(name, 0, u32::MAX).await.map_err(|error| error.to_string())?;
             told_once(&job, &events, known).map_err(|what| format!("{name}: {what}"))?;
-            came_right(&store, &job).await.map_err(|what| format!("{name}: {what}"))?;
+            came_right(&store, &job, is_disturbed).await.map_err(|what| format!("{name}: {what}"))?;
         }
         // Of requests without an answer there may be jobs, one each.
         let jobs = cluster.numbers("SELECT COUNT(*) AS number FROM jobs")[0];
@@ -89,7 +89,7 @@ fn terminal(event: &JobEvent) -> Option<JobState> {
 }
 
 /// The end is one that the job can come to, and a result is its own.
-async fn came_right(store: &dyn Store, job: &Job) -> Result<(), String> {
+async fn came_right(store: &dyn Store, job: &Job, is_disturbed: bool) -> Result<(), String> {
     let number = job.name.job.trim_start_matches("job-").parse().map_err(|_| "a foreign job".to_owned())?;
     let behavior = JobBehavior::of(request(number).settings.seed);
     let reason = job.failure.as_ref().map(|failure| failure.reason.as_str());
@@ -103,6 +103,7 @@ async fn came_right(store: &dyn Store, job: &Job) -> Result<(), String> {
         JobState::Failed if reason == Some(ATTEMPTS_EXHAUSTED) => {
             let lost = job.failure.as_ref().map_or(0, |failure| failure.attempts.len());
             ensure!(lost >= MAX_ATTEMPTS as usize, "given up after {lost} attempts");
+            ensure!(is_disturbed || behavior == JobBehavior::Kill, "it failed by what its neighbours did");
         }
         JobState::Failed => ensure!(behavior == JobBehavior::Fail, "it failed by {reason:?}"),
         JobState::Cancelled => {}
