@@ -5,6 +5,7 @@ use std::time::SystemTime;
 use serde_json::{Value, json};
 
 use super::access::AccessArgs;
+use super::args::ServerArgs;
 use super::exit::{Exit, Failure};
 use super::interrupt::Signals;
 use super::next_steps;
@@ -94,6 +95,22 @@ pub fn print_job(job: &Job, json: bool) -> Result<(), Failure> {
     lines.extend(job.webhook.as_ref().map(webhook_line));
     lines.extend(job.summary.iter().flat_map(warning_lines));
     print(&lines.join("\n"))
+}
+
+/// Changes each of several jobs and prints it as it stands then; stops at the first that cannot be changed.
+pub async fn change_each(
+    server: &ServerArgs,
+    names: &[GivenName],
+    json: bool,
+    change: impl AsyncFn(&mut Client, &JobName) -> Result<Job, client::Error>,
+) -> Result<Exit, Failure> {
+    // All of them are named before the first is changed.
+    let names = names.iter().map(|name| name.of(&server.access)).collect::<Result<Vec<_>, _>>()?;
+    let mut client = server.connect().await?;
+    for name in names {
+        print_job(&change(&mut client, &name).await?, json)?;
+    }
+    Ok(Exit::Done)
 }
 
 /// Why a job failed, for programs; attempts only where there are any to tell of.
