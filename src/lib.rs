@@ -7,15 +7,17 @@
 //!
 //! ```text
 //! cli -> http -> rpc -> engine -> { store, scpsfm_core } -> domain
+//! cli -> client -> rpc
 //! ```
 //!
 //! Beside them `evaluation` holds the methods against the truth of [`synthetic`] scenes, `formats` and `report` read and
 //! write files.
 //!
-//! Only [`rpc`], [`http`] and the client side of [`cli`] see prost and tonic, only [`store`] sees SQL
-//! (but for `formats`, which reads COLMAP's databases).
+//! [`client`] is for programs that call the service. Only it, [`rpc`], [`http`] and the commands that show the API's
+//! messages see prost and tonic, only [`store`] sees SQL (but for `formats`, which reads COLMAP's databases).
 
 pub mod cli;
+pub mod client;
 pub mod config;
 pub mod domain;
 pub mod engine;

@@ -6,6 +6,8 @@ use serde_json::{Value, json};
 use super::args::ServerArgs;
 use super::exit::{Exit, Failure};
 use super::print;
+use crate::domain::job::JobState;
+use crate::rpc::convert::enums::Twin;
 use crate::rpc::proto;
 
 const EXAMPLES: &str = "\
@@ -69,13 +71,13 @@ pub async fn run(args: Args) -> Result<Exit, Failure> {
     Ok(Exit::Done)
 }
 
-/// The name of a state without the enum's prefix.
-fn state_name(state: proto::JobState) -> &'static str {
-    state.as_str_name().trim_start_matches("JOB_STATE_")
+/// The name of the state that is counted; a server of a later version may count others.
+fn state_name(of: &proto::JobCount) -> &'static str {
+    JobState::required(of.state, "state").map_or("UNKNOWN", JobState::name)
 }
 
 fn queue_json(queue: &proto::Queue) -> Value {
-    let counts = queue.job_counts.iter().map(|of| (state_name(of.state()).to_owned(), json!(of.count)));
+    let counts = queue.job_counts.iter().map(|of| (state_name(of).to_owned(), json!(of.count)));
     let tenant = |of: &proto::TenantQueue| {
         let (queued, running) = (of.queued_job_count, of.running_job_count);
         json!({ "tenant": of.tenant, "queued_jobs": queued, "running_jobs": running })
@@ -95,7 +97,7 @@ fn queue_text(queue: &proto::Queue) -> String {
         Some(time) => format!("paused since {time}"),
         None => "not paused".to_owned(),
     }];
-    lines.extend(queue.job_counts.iter().map(|of| format!("{:<17} {:>8}", state_name(of.state()), of.count)));
+    lines.extend(queue.job_counts.iter().map(|of| format!("{:<17} {:>8}", state_name(of), of.count)));
     if let Some(time) = queue.oldest_queue_time {
         lines.push(format!("oldest waiting: {} since {time}", queue.oldest_job));
     }

@@ -5,9 +5,9 @@ use std::str::FromStr;
 
 use clap::{Args, ValueEnum};
 
-use super::client::access::AccessArgs;
-use super::client::{self, Client};
+use super::access::AccessArgs;
 use super::exit::Failure;
+use crate::client::{Client, MAX_WAIT};
 use crate::domain::{Backend, FocalPrior, ImageSize, Limits, Method, Solution, SolveSettings};
 use crate::formats::{self, Export, Format, LabelledInput, Matches, Reading, result_files};
 use crate::parallel::Threads;
@@ -27,12 +27,14 @@ pub struct ServerArgs {
 }
 
 impl ServerArgs {
-    /// Connects to it.
+    /// Connects to it; where a call has to wait, it is told on stderr.
     ///
     /// # Errors
     /// See [`Client::connect`].
-    pub async fn connect(&self) -> Result<Client, client::Error> {
-        Client::connect(&self.server, &self.access).await
+    pub async fn connect(&self) -> Result<Client, Failure> {
+        let mut client = Client::connect(&self.server, &self.access.options()?).await?;
+        client.on_wait(|trouble| tell!("waiting up to {} s: {trouble}", MAX_WAIT.as_secs()));
+        Ok(client)
     }
 }
 

@@ -30,11 +30,5 @@ pub struct Args {
 
 /// Runs the command.
 pub async fn run(args: Args) -> Result<Exit, Failure> {
-    // All of them are named before the first is stopped.
-    let names = args.names.iter().map(|name| name.of(&args.server.access)).collect::<Result<Vec<_>, _>>()?;
-    let mut client = args.server.connect().await?;
-    for name in names {
-        job_view::print_job(&client.cancel(&name).await?, args.json)?;
-    }
-    Ok(Exit::Done)
+    job_view::change_each(&args.server, &args.names, args.json, async |client, name| client.cancel(name).await).await
 }

@@ -58,4 +58,27 @@ mod tests {
             }
         }
     }
+
+    /// bash itself reads the script and completes the word that a user has begun.
+    #[test]
+    fn bash_completes_subcommands_flags_and_values() {
+        let directory = tempfile::tempdir().expect("a temporary directory");
+        let path = directory.path().join("completions");
+        std::fs::write(&path, script(Shell::Bash).expect("text")).expect("written");
+        // As bash calls it: the command, the word and the one before it.
+        let program = r#"source "$1"; shift; COMP_WORDS=("$@"); COMP_CWORD=$(($# - 1))
+            _scpsfm scpsfm "${COMP_WORDS[COMP_CWORD]}" "${COMP_WORDS[COMP_CWORD - 1]}"; echo "${COMPREPLY[@]}""#;
+        for (words, expected) in [
+            (["scpsfm", "canc"].as_slice(), "cancel"),
+            (&["scpsfm", "submit", "--request"], "--request-id"),
+            (&["scpsfm", "solve", "--method", "geo"], "geometry"),
+        ] {
+            let bash = std::process::Command::new("bash").args(["-c", program, "bash"]).arg(&path).args(words).output();
+            let output = match bash {
+                Err(error) if error.kind() == std::io::ErrorKind::NotFound => return,
+                output => output.expect("bash runs"),
+            };
+            assert_eq!(String::from_utf8_lossy(&output.stdout).trim(), expected, "{words:?}: {output:?}");
+        }
+    }
 }

@@ -5,15 +5,14 @@ use std::path::{Path, PathBuf};
 
 use serde_json::json;
 
-use super::args::ServerArgs;
-use super::client::access::AccessArgs;
 use super::exit::{Exit, Failure};
 use super::interrupt::Interrupt;
 use super::next_steps::Files;
 use super::progress::ProgressView;
 use super::service::Service;
 use super::synth::{self, SceneArgs};
-use super::{client, job_view, print, summary};
+use super::{job_view, print, summary};
+use crate::client::{Client, Options};
 use crate::config::Config;
 use crate::domain::job::JobEvent;
 use crate::domain::{Solution, SolveSettings};
@@ -77,12 +76,15 @@ pub async fn run(args: Args) -> Result<Exit, Failure> {
     let data = tempfile::tempdir()?;
     let service = Service::start(&config(data.path()), std::future::pending()).await?;
     let service = service.ok_or_else(|| Failure::internal("the service was ended before it had started"))?;
-    let server = ServerArgs { server: format!("http://{}", service.address()), access: AccessArgs::default() };
-    progress.state(&format!("server: {}, store in {}", server.server, data.path().display()));
+    let server = format!("http://{}", service.address());
+    progress.state(&format!("server: {server}, store in {}", data.path().display()));
     let interrupt = Interrupt::listen()?;
     let mut on_event = |event: &JobEvent| job_view::show_event(&mut progress, event);
     let settings = SolveSettings::default();
-    let outcome = client::solve(&server, &scene.input, &settings, &mut on_event, interrupt.token()).await;
+    let outcome = match Client::connect(&server, &Options::default()).await {
+        Ok(mut client) => client.solve(&scene.input, &settings, &mut on_event, interrupt.token()).await,
+        Err(error) => Err(error),
+    };
     progress.finish();
     service.stop(std::future::pending()).await?;
     let solution = outcome?;

@@ -4,13 +4,14 @@ use std::time::SystemTime;
 
 use serde_json::{Value, json};
 
-use super::client::access::AccessArgs;
-use super::client::{self, Client};
+use super::access::AccessArgs;
+use super::args::ServerArgs;
 use super::exit::{Exit, Failure};
 use super::interrupt::Signals;
 use super::next_steps;
 use super::print;
 use super::progress::ProgressView;
+use crate::client::{self, Client, ErrorKind};
 use crate::domain::job::{EventBody, Failure as JobFailure, Job, JobEvent, JobName, JobState, PastAttempt, Summary};
 use crate::domain::{Grade, InputName, Status, Warning, Webhook};
 
@@ -37,7 +38,7 @@ impl GivenName {
     ///
     /// # Errors
     /// For a tenant that is none.
-    pub fn of(&self, access: &AccessArgs) -> Result<JobName, client::Error> {
+    pub fn of(&self, access: &AccessArgs) -> Result<JobName, Failure> {
         match self {
             Self::Whole(name) => Ok(name.clone()),
             Self::Id(job) => Ok(JobName { tenant: access.tenant()?, job: job.clone() }),
@@ -94,6 +95,22 @@ pub fn print_job(job: &Job, json: bool) -> Result<(), Failure> {
     lines.extend(job.webhook.as_ref().map(webhook_line));
     lines.extend(job.summary.iter().flat_map(warning_lines));
     print(&lines.join("\n"))
+}
+
+/// Changes each of several jobs and prints it as it stands then; stops at the first that cannot be changed.
+pub async fn change_each(
+    server: &ServerArgs,
+    names: &[GivenName],
+    json: bool,
+    change: impl AsyncFn(&mut Client, &JobName) -> Result<Job, client::Error>,
+) -> Result<Exit, Failure> {
+    // All of them are named before the first is changed.
+    let names = names.iter().map(|name| name.of(&server.access)).collect::<Result<Vec<_>, _>>()?;
+    let mut client = server.connect().await?;
+    for name in names {
+        print_job(&change(&mut client, &name).await?, json)?;
+    }
+    Ok(Exit::Done)
 }
 
 /// Why a job failed, for programs; attempts only where there are any to tell of.
@@ -276,7 +293,7 @@ pub struct Lost<'a> {
 
 /// The failure of a call; where the server is lost, with the commands that take the job up again.
 pub fn lost(error: client::Error, job: &Lost) -> Failure {
-    if !matches!(error, client::Error::Unavailable(_)) {
+    if error.kind != ErrorKind::Unavailable {
         return error.into();
     }
     let mut failure = Failure::from(error);
@@ -321,14 +338,14 @@ mod tests {
         let given = GivenName::parse("a-1").expect("a name");
         let name = given.of(&AccessArgs::default()).expect("a tenant");
         let job = Lost { name: &name, server: "http://h:1", after: 7, files: " --out 'a b'" };
-        let words = lost(client::Error::Unavailable("gone".into()), &job).message;
+        let words = lost(ErrorKind::Unavailable.error("gone"), &job).message;
         assert!(words.starts_with("gone\nthe job is tenants/default/jobs/a-1;"), "{words}");
         assert!(words.contains("\n  scpsfm watch tenants/default/jobs/a-1 --server http://h:1 --after 7\n"), "{words}");
         assert!(
             words.ends_with("\n  scpsfm result tenants/default/jobs/a-1 --server http://h:1 --out 'a b'"),
             "{words}"
         );
-        assert_eq!(lost(client::Error::Refused("no".into()), &job).message, "no");
+        assert_eq!(lost(ErrorKind::Refused.error("no"), &job).message, "no");
         assert_eq!((quoted("a/b.csv"), quoted("it's").as_str()), ("a/b.csv".to_owned(), "'it'\\''s'"));
     }
 

@@ -1,6 +1,6 @@
 //! The command line: one file a subcommand, plus what they share (arguments, exit codes, progress).
 //!
-//! May depend on everything; only `client.rs` and the commands that talk to a server see prost and tonic.
+//! May depend on everything. Commands that talk to a server use `client`; few of them see the API's messages.
 
 /// Writes a line to standard error. That its reader has gone ends nothing: what is computed is worth more than its
 /// progress.
@@ -11,10 +11,10 @@ macro_rules! tell {
     }};
 }
 
+pub mod access;
 pub mod admin;
 pub mod args;
 pub mod cancel;
-pub mod client;
 pub mod completions;
 pub mod delete;
 pub mod demo;
@@ -35,6 +35,7 @@ pub mod next_steps;
 pub mod prior_file;
 pub mod priority;
 pub mod progress;
+pub mod remote;
 pub mod result;
 pub mod retry;
 pub mod scene_args;

@@ -2,8 +2,8 @@
 
 use std::path::PathBuf;
 
+use super::access::AccessArgs;
 use super::args::{ExportArgs, InputArgs, ServerArgs, SettingsArgs, tell_notes};
-use super::client::access::AccessArgs;
 use super::exit::{Exit, Failure};
 use super::interrupt::Interrupt;
 use super::job_view::{Lost, quoted};
@@ -11,7 +11,8 @@ use super::next_steps::Files;
 use super::prior_file::PriorFileArgs;
 use super::progress::ProgressView;
 use super::windows::{self, Show, WindowArgs};
-use super::{client, job_view, print, summary};
+use super::{job_view, print, remote, summary};
+use crate::client::ErrorKind;
 use crate::domain::job::JobEvent;
 use crate::domain::{Limits, Solution, SolveSettings, StopToken};
 use crate::formats::publish::create_directory;
@@ -149,10 +150,10 @@ async fn on_server(
         seen.get_or_insert_with(|| event.job.clone());
         job_view::show_event(progress, event);
     };
-    let outcome = client::solve(&server, input, settings, &mut on_event, interrupt.token()).await;
-    outcome.map_err(|error| match (error, seen) {
-        (client::Error::Cancelled, _) if interrupt.token().is_cancelled() => Failure::interrupted(),
-        (error @ client::Error::Unavailable(_), Some(name)) => {
+    let outcome = server.connect().await?.solve(input, settings, &mut on_event, interrupt.token()).await;
+    outcome.map_err(|error| match (error.kind, seen) {
+        (ErrorKind::Cancelled, _) if interrupt.token().is_cancelled() => Failure::interrupted(),
+        (ErrorKind::Unavailable, Some(name)) => {
             let files = format!(
                 " --out {} --input {}{}",
                 quoted(&args.out.to_string_lossy()),
@@ -161,7 +162,7 @@ async fn on_server(
             );
             job_view::lost(error, &Lost { name: &name, server: &server.server, after: 0, files: &files })
         }
-        (error, _) => error.at_lines(input),
+        _ => remote::at_lines(error, input),
     })
 }
 

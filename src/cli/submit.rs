@@ -6,11 +6,11 @@ use std::time::Duration;
 
 use clap::builder::NonEmptyStringValueParser;
 
+use super::access::AccessArgs;
 use super::args::{ReadingArgs, ServerArgs, SettingsArgs, tell_notes};
-use super::client::access::AccessArgs;
-use super::client::{self, JobOptions};
 use super::exit::{Exit, Failure};
-use super::{job_view, print};
+use super::{job_view, print, remote};
+use crate::client::JobOptions;
 use crate::domain::job::JobName;
 use crate::domain::{InputName, Webhook};
 use crate::formats::STANDARD_INPUT;
@@ -120,11 +120,14 @@ pub async fn run(args: Args) -> Result<Exit, Failure> {
         // Tracks, which are less than keypoints and matches: all inputs share one message.
         let inputs = read.iter().map(|input| &input.raw);
         let created = client.create_batch(inputs, &named, &settings, &options).await;
-        let jobs = created.map_err(|error| error.at_lines_of(&read))?;
+        let jobs = created.map_err(|error| remote::at_lines_of(error, &read))?;
         return jobs.iter().try_for_each(|job| print(&job.name.to_string())).map(|()| Exit::Done);
     }
     let job = match (read.first(), named.first()) {
-        (Some(input), _) => client.create(input, &settings, options).await.map_err(|error| error.at_lines(input))?,
+        (Some(input), _) => {
+            let created = client.create(input, &settings, options).await;
+            created.map_err(|error| remote::at_lines(error, input))?
+        }
         (None, Some(name)) => client.create_with(name, &settings, options).await?,
         (None, None) => return Err(nothing()),
     };
@@ -155,7 +158,7 @@ impl GivenInput {
     ///
     /// # Errors
     /// For a tenant that is none.
-    pub fn of(&self, access: &AccessArgs) -> Result<InputName, client::Error> {
+    pub fn of(&self, access: &AccessArgs) -> Result<InputName, Failure> {
         match self {
             Self::Whole(name) => Ok(name.clone()),
             Self::Id(input) => Ok(InputName { tenant: access.tenant()?, input: input.clone() }),

@@ -1,10 +1,10 @@
 //! `scpsfm upload`: leaves an input with a server.
 
 use super::args::{InputArgs, ServerArgs, tell_notes};
-use super::client::upload::Encoded;
 use super::exit::{Exit, Failure};
-use super::print;
 use super::progress::TransferView;
+use super::{print, remote};
+use crate::client::EncodedInput;
 
 const EXAMPLES: &str = "\
 Examples:
@@ -34,11 +34,11 @@ pub async fn run(args: Args) -> Result<Exit, Failure> {
     let input = args.input.read()?;
     tell_notes(&input);
     let mut client = args.server.connect().await?;
-    let encoded = Encoded::new(&input);
+    let encoded = EncodedInput::new(&input);
     let mut view = TransferView::new(args.quiet, encoded.len());
     let uploaded = client.upload(&encoded, &mut |bytes| view.show(bytes)).await;
     view.finish();
-    let name = uploaded.map_err(|error| error.at_lines(&input))?;
+    let name = uploaded.map_err(|error| remote::at_lines(error, &input))?;
     print(&name.to_string())?;
     Ok(Exit::Done)
 }

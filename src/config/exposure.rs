@@ -2,7 +2,8 @@
 
 use std::net::SocketAddr;
 
-use super::sections::{Auth, Http, Server, Tls};
+use super::http::Http;
+use super::sections::{Auth, Server, Tls};
 
 /// A port that others than this machine could reach, without enough to keep them out; says what to do.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]

@@ -6,8 +6,10 @@
 mod endpoint;
 mod exposure;
 mod file;
+mod http;
 mod retention;
 mod sections;
+mod webhooks;
 mod weights;
 
 use std::path::{Path, PathBuf};
@@ -17,8 +19,10 @@ use serde::{Deserialize, Serialize};
 use crate::domain::Limits;
 use crate::store::postgres::DatabaseUrl;
 pub use endpoint::Endpoint;
+pub use http::Http;
 pub use retention::Retention;
-pub use sections::{Auth, Compute, Engine, Http, Log, Metrics, Otlp, Rates, Server, Store, Tls, Upload, Webhooks};
+pub use sections::{Auth, Compute, Engine, Log, Metrics, Otlp, Rates, Server, Store, Tls, Upload};
+pub use webhooks::Webhooks;
 pub use weights::TenantWeights;
 
 /// Everything that the server can be told.

@@ -1,17 +1,16 @@
-//! The sections of the configuration, one type each, with every default and its reason.
+//! The sections of the configuration, one type each, with every default and its reason; the longer ones have files of
+//! their own.
 
 use std::net::{IpAddr, Ipv4Addr, SocketAddr};
 use std::num::NonZeroU32;
 use std::path::PathBuf;
 
-use axum::http::uri::Authority;
 use serde::de::IntoDeserializer;
-use serde::{Deserialize, Deserializer, Serialize, Serializer};
+use serde::{Deserialize, Deserializer, Serialize};
 
 use super::weights::TenantWeights;
 use super::{Endpoint, Error, Retention};
 use crate::domain::Backend;
-use crate::engine::WebhookSecrets;
 use crate::parallel::Threads;
 use crate::rpc::keys::KeyRing;
 use crate::store::postgres::DatabaseUrl;
@@ -64,73 +63,6 @@ impl Default for Server {
             reflection: true,
             insecure: false,
             plaintext_keys: false,
-        }
-    }
-}
-
-/// The port for JSON over HTTP, with the keys and certificates of the gRPC port.
-#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
-#[serde(default, deny_unknown_fields)]
-pub struct Http {
-    /// Address and port to listen on, port 0 takes a free one; `off`: there is none.
-    #[serde(deserialize_with = "address_or_off", serialize_with = "or_off")]
-    pub listen: Option<SocketAddr>,
-    /// Largest body of JSON.
-    pub max_body_bytes: usize,
-    /// Names of hosts under which the port is reached, separated by commas; of no use with keys. Without keys only
-    /// addresses and localhost are answered else: a page could have its own name point to this machine.
-    pub hosts: String,
-    /// Origins of pages that may call the API from a browser, separated by commas; none by default: whoever opens such
-    /// a page lends it what the browser's machine may reach.
-    pub allowed_origins: String,
-}
-
-impl Http {
-    /// The names of hosts, one by one.
-    pub fn hosts(&self) -> Vec<String> {
-        words(&self.hosts)
-    }
-
-    /// The origins, one by one.
-    pub fn allowed_origins(&self) -> Vec<String> {
-        words(&self.allowed_origins)
-    }
-
-    /// Whether the origins are what a browser calls a page's.
-    pub(super) fn validate(&self) -> Result<(), Error> {
-        let is_origin = |text: &str| {
-            let Some((scheme @ ("http" | "https"), authority)) = text.split_once("://") else { return false };
-            // A browser leaves the port of the scheme out, so that an origin with it would never be met.
-            let is_default_port = |port| matches!((scheme, port), ("http", 80) | ("https", 443));
-            let parsed = authority.parse::<Authority>();
-            !authority.contains(['*', '@'])
-                && parsed.is_ok_and(|authority| !authority.port_u16().is_some_and(is_default_port))
-        };
-        match self.allowed_origins().into_iter().find(|origin| !is_origin(origin)) {
-            Some(wrong) => Err(Error::Value {
-                key: "http.allowed_origins",
-                found: format!("`{wrong}`"),
-                right: "origins of pages as browsers write them, without a path and without port 443 of https and 80 of http, such \
-                        as `https://app.example`, separated by commas",
-            }),
-            None => Ok(()),
-        }
-    }
-}
-
-/// What stands between the commas of a text.
-fn words(text: &str) -> Vec<String> {
-    text.split(',').map(|word| word.trim().to_owned()).filter(|word| !word.is_empty()).collect()
-}
-
-impl Default for Http {
-    fn default() -> Self {
-        Self {
-            // Loopback, as gRPC's; 8080 is the customary port for HTTP that needs no rights.
-            listen: Some(SocketAddr::new(IpAddr::V4(Ipv4Addr::LOCALHOST), 8080)),
-            max_body_bytes: crate::http::MAX_BODY_BYTES,
-            hosts: String::new(),
-            allowed_origins: String::new(),
         }
     }
 }
@@ -442,88 +374,11 @@ pub struct Otlp {
     pub endpoint: Option<Endpoint>,
 }
 
-/// Delivery of the ends of jobs to the URLs that they name. Off without a secret.
-#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
-#[serde(default, deny_unknown_fields)]
-pub struct Webhooks {
-    /// What deliveries are signed with, `whsec_` and the base64 of 24 to 64 random bytes; or `TENANT:SECRET` for one
-    /// tenant. Several are separated by commas. For the environment; shown nowhere.
-    #[serde(skip_serializing)]
-    pub secret: Option<WebhookSecrets>,
-    /// File of more of them, one a line; `#` begins a comment. Read at the start.
-    #[serde(skip_serializing_if = "Option::is_none")]
-    pub secret_file: Option<PathBuf>,
-    /// How long after a job's end failed attempts are repeated: `24h`, `90m`, `45s` (1000 years at most), or `forever`:
-    /// as long as the job is kept.
-    pub retry_for: Retention,
-    /// Whether receivers may have private, loopback, link-local and other special addresses. Off, because whoever may
-    /// create jobs could reach with it what only this machine should reach.
-    pub allow_private_addresses: bool,
-}
-
-impl Default for Webhooks {
-    fn default() -> Self {
-        Self {
-            secret: None,
-            secret_file: None,
-            retry_for: Retention(Some(engine::WebhookOptions::DEFAULT_RETRY_FOR)),
-            allow_private_addresses: false,
-        }
-    }
-}
-
-impl Webhooks {
-    /// The options of the engine; `None`: webhooks are off.
-    ///
-    /// # Errors
-    /// What is wrong with the file of secrets, which is named; nothing of what it holds.
-    pub fn options(&self, encode: engine::JobEncoder) -> Result<Option<engine::WebhookOptions>, Error> {
-        let wrong = |path: &PathBuf, what: &str| Error::Value {
-            key: "webhooks.secret_file",
-            found: format!("{}: {what}", path.display()),
-            right: "a file with lines SECRET or TENANT:SECRET, such as whsec_ and `openssl rand -base64 32`",
-        };
-        let read = |path: &PathBuf| {
-            let text = std::fs::read_to_string(path).map_err(|error| wrong(path, &error.to_string()))?;
-            text.parse::<WebhookSecrets>().map_err(|error| wrong(path, &error))
-        };
-        let from_file = self.secret_file.as_ref().map(read).transpose()?;
-        let secrets = match (&self.secret, from_file) {
-            (Some(given), Some(read)) => read.with(given),
-            (given, read) => match read.or_else(|| given.clone()) {
-                Some(secrets) => secrets,
-                None => return Ok(None),
-            },
-        };
-        Ok(Some(engine::WebhookOptions {
-            secrets,
-            retry_for: self.retry_for.0,
-            allow_private_addresses: self.allow_private_addresses,
-            encode,
-        }))
-    }
-}
-
-/// What turns a port off.
-const OFF: &str = "off";
-
-fn address_or_off<'de, D: Deserializer<'de>>(deserializer: D) -> Result<Option<SocketAddr>, D::Error> {
-    let text = String::deserialize(deserializer)?;
-    if text == OFF { Ok(None) } else { parse_address(&text).map(Some) }
-}
-
-fn or_off<S: Serializer>(address: &Option<SocketAddr>, serializer: S) -> Result<S::Ok, S::Error> {
-    match address {
-        Some(address) => address.serialize(serializer),
-        None => serializer.serialize_str(OFF),
-    }
-}
-
 fn address<'de, D: Deserializer<'de>>(deserializer: D) -> Result<SocketAddr, D::Error> {
     parse_address(&String::deserialize(deserializer)?)
 }
 
-fn parse_address<E: serde::de::Error>(text: &str) -> Result<SocketAddr, E> {
+pub(super) fn parse_address<E: serde::de::Error>(text: &str) -> Result<SocketAddr, E> {
     text.parse().map_err(|_| {
         let message = format!("`{text}` is not an IP address and port, such as 127.0.0.1:50051 or [::1]:50051");
         E::custom(message)

@@ -21,6 +21,7 @@ use super::answer::{self, Answer};
 use super::codec::Encoded;
 use super::origin::{self, Origin};
 use super::route::{self, Found, Route};
+use super::unique_keys::UniqueKeys;
 use super::{Options, console, grpc_web, openapi, upload};
 use crate::domain::Violation;
 use crate::domain::error::quoted;
@@ -278,9 +279,11 @@ impl Api {
             return Err(answer::refuse(HttpRefusal::MediaType, text));
         }
         let parse = move || {
-            let mut json = serde_json::Deserializer::from_slice(&text);
-            let message = DynamicMessage::deserialize(descriptor, &mut json);
-            let message = message.and_then(|message| json.end().map(|()| message));
+            let message = serde_json::from_slice::<UniqueKeys>(&text).and_then(|_| {
+                let mut json = serde_json::Deserializer::from_slice(&text);
+                let message = DynamicMessage::deserialize(descriptor, &mut json)?;
+                json.end().map(|()| message)
+            });
             Ok(message.map_err(|error| error.to_string().chars().take(MAX_DESCRIPTION).collect::<String>()))
         };
         let message = in_background(length, parse).await.map_err(failed)?;

@@ -20,6 +20,7 @@ mod grpc_web;
 mod openapi;
 mod origin;
 mod route;
+mod unique_keys;
 mod upload;
 
 use std::convert::Infallible;

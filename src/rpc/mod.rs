@@ -1,6 +1,7 @@
 //! The gRPC side: generated messages, their translation from and to the domain, and one file a service.
 //!
-//! Depends on `engine`, `telemetry` and `domain`; this module, `http` and the client side of `cli` see prost and tonic.
+//! Depends on `engine`, `telemetry` and `domain`; this module, `http`, `client` and a few commands see prost and
+//! tonic.
 
 pub mod admin;
 pub mod auth;

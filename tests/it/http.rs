@@ -224,6 +224,9 @@ fn what_is_wrong_is_told_by_field_and_nothing_is_stored() {
     let json = [("content-type", "application/json")];
     let cut = request(&server, "POST", jobs, &json, b"{\"trackSet\": {");
     assert_eq!((cut.code, cut.refusal().1.as_str()), (400, "body"));
+    let twice = request(&server, "POST", jobs, &json, br#"{"input": "a", "job": {"priority": 1, "priority": 2}}"#);
+    assert_eq!((twice.code, twice.refusal().1.as_str()), (400, "body"));
+    assert!(String::from_utf8_lossy(&twice.body).contains("`priority` is given twice"), "{:?}", twice.body);
     let deep = format!("{{\"job\": {{\"labels\": {}", "[".repeat(100_000));
     let deep = request(&server, "POST", jobs, &json, deep.as_bytes());
     assert_eq!((deep.code, deep.refusal().1.as_str()), (400, "body"));

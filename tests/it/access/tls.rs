@@ -4,8 +4,7 @@ use std::path::Path;
 use std::sync::Arc;
 use std::time::Duration;
 
-use scpsfm::cli::client::access::AccessArgs;
-use scpsfm::cli::client::{Client, Error};
+use scpsfm::client::{self, Client, Error, ErrorKind, Setting};
 use scpsfm::rpc::proto::job_service_client::JobServiceClient;
 use scpsfm::rpc::proto::{self, JobState};
 use scpsfm::rpc::server::Options;
@@ -40,12 +39,12 @@ fn url(server: &TestServer) -> String {
 }
 
 /// A client that trusts this authority.
-fn trusting(authority: &Path) -> AccessArgs {
-    AccessArgs { tls_ca: Some(authority.to_owned()), ..AccessArgs::default() }
+fn trusting(authority: &Path) -> client::Options {
+    client::Options { tls_ca: Some(authority.to_owned()), ..client::Options::default() }
 }
 
 /// Connects and makes a call: some refusals come only with the answer to the first.
-async fn greet(url: &str, access: &AccessArgs) -> Result<(), Error> {
+async fn greet(url: &str, access: &client::Options) -> Result<(), Error> {
     let mut client = soon(Client::connect(url, access)).await?;
     soon(client.list("", 1, "")).await.map(drop)
 }
@@ -60,27 +59,27 @@ async fn the_server_must_be_who_it_says_and_errors_say_what_to_do() {
     let server = TestServer::start_with(quick(), options(&here, None), one_worker()).await;
     greet(&url(&server), &trusting(&ours)).await.expect("trusted");
 
-    let refused = async |url: &str, access: &AccessArgs, part: &str| {
+    let refused = async |url: &str, access: &client::Options, part: &str| {
         let error = greet(url, access).await.expect_err(part);
-        assert!(matches!(error, Error::NotLetIn(_)) && error.to_string().contains(part), "{error:?}");
+        assert!(error.kind == ErrorKind::NotLetIn && error.message.contains(part), "{error:?}");
     };
-    refused(&url(&server), &trusting(&other), "--tls-ca").await;
+    refused(&url(&server), &trusting(&other), "`tls_ca`").await;
     let elsewhere = authority.issue(at, "elsewhere", &["far.example"]);
     let misnamed = TestServer::start_with(quick(), options(&elsewhere, None), one_worker()).await;
     refused(&url(&misnamed), &trusting(&ours), "another name").await;
     let unencrypted = format!("http://{}", server.server.address());
-    let error = greet(&unencrypted, &AccessArgs::default()).await.expect_err("TLS there");
+    let error = greet(&unencrypted, &client::Options::default()).await.expect_err("TLS there");
     // In which words depends on which side closes first.
-    assert!(matches!(error, Error::Unavailable(_)), "{error:?}");
+    assert_eq!(error.kind, ErrorKind::Unavailable, "{error:?}");
     let own = Authority::new("own").own(at, "own");
     let itself = TestServer::start_with(quick(), options(&own, None), one_worker()).await;
     refused(&url(&itself), &trusting(&own.certificate), "CA:FALSE").await;
     let plain = TestServer::start(quick()).await;
     refused(&url(&plain), &trusting(&ours), "http://").await;
     let error = Client::connect(&plain.url(), &trusting(&ours)).await.expect_err("no TLS there");
-    assert!(matches!(&error, Error::Usage(message) if message.contains("https://")), "{error:?}");
+    assert!(error.kind == ErrorKind::Usage && error.message.contains("https://"), "{error:?}");
     let error = Client::connect(&url(&server), &trusting(&here.key)).await.expect_err("a key is no certificate");
-    assert!(matches!(&error, Error::Usage(message) if message.contains("--tls-ca")), "{error:?}");
+    assert_eq!((error.kind, error.setting), (ErrorKind::Usage, Some(Setting::TlsCa)), "{error:?}");
 }
 
 #[tokio::test]
@@ -91,7 +90,7 @@ async fn with_a_client_authority_only_its_clients_are_let_in() {
     let ours = authority.write(at, "ours.pem");
     let here = authority.issue(at, "here", &HERE);
     let server = TestServer::start_with(quick(), options(&here, Some(&ours)), one_worker()).await;
-    let showing = |identity: &Identity| AccessArgs {
+    let showing = |identity: &Identity| client::Options {
         tls_cert: Some(identity.certificate.clone()),
         tls_key: Some(identity.key.clone()),
         ..trusting(&ours)
@@ -99,10 +98,10 @@ async fn with_a_client_authority_only_its_clients_are_let_in() {
     let client = authority.issue(at, "client", &["client"]);
     greet(&url(&server), &showing(&client)).await.expect("let in");
     let error = greet(&url(&server), &trusting(&ours)).await.expect_err("no certificate");
-    assert!(matches!(&error, Error::NotLetIn(message) if message.contains("asks for a client's")), "{error:?}");
+    assert!(error.kind == ErrorKind::NotLetIn && error.message.contains("asks for a client's"), "{error:?}");
     let stranger = others.issue(at, "stranger", &["client"]);
     let error = greet(&url(&server), &showing(&stranger)).await.expect_err("a stranger");
-    assert!(matches!(&error, Error::NotLetIn(message) if message.contains("does not trust")), "{error:?}");
+    assert!(error.kind == ErrorKind::NotLetIn && error.message.contains("does not trust"), "{error:?}");
 }
 
 /// The certificate that the server shows now, and the protocol that it agrees to.

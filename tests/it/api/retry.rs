@@ -72,7 +72,7 @@ async fn a_job_that_failed_is_solved_at_the_second_try() {
     assert_eq!(rest.first().and_then(state_of), Some(JobState::Queued), "new events follow the earlier end");
     jobs.get_job_result(proto::GetJobResultRequest { name: name.clone() }).await.expect("a result");
 
-    // The command line's client goes over the earlier end, too.
+    // The client goes over the earlier end, too.
     let parsed = JobName::parse(&name).expect("a name");
     let mut ends = Vec::new();
     let mut on_event = |event: &JobEvent| {
@@ -81,7 +81,7 @@ async fn a_job_that_failed_is_solved_at_the_second_try() {
         }
     };
     let last = soon(server.client().await.watch(&parsed, 0, &mut on_event)).await.expect("watched").expect("an event");
-    scpsfm::cli::client::ended(&last).expect("it succeeded");
+    scpsfm::client::ended(&last).expect("it succeeded");
     assert_eq!(ends, [DomainState::Failed, DomainState::Succeeded]);
 
     let status = retry(&mut jobs, &name, "").await.expect_err("has succeeded");

@@ -4,8 +4,7 @@ use std::path::Path;
 use std::sync::Arc;
 use std::time::Duration;
 
-use scpsfm::cli::client::Client;
-use scpsfm::cli::client::access::AccessArgs;
+use scpsfm::client::{self, Client};
 use scpsfm::engine::{self, Engine, Solver};
 use scpsfm::rpc::convert::result::encode as encode_result;
 use scpsfm::rpc::proto::calibration_service_client::CalibrationServiceClient;
@@ -71,7 +70,7 @@ impl TestServer {
     }
 
     pub async fn client(&self) -> Client {
-        Client::connect(&self.url(), &AccessArgs::default()).await.expect("a connection")
+        Client::connect(&self.url(), &client::Options::default()).await.expect("a connection")
     }
 }
 

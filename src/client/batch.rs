@@ -14,7 +14,7 @@ impl Client {
     /// A request id that is given stands, with the number of the job after it, for each of them.
     ///
     /// # Errors
-    /// See [`Error`]; fields are those of one input, see [`Error::at_lines_of`].
+    /// See [`Error`]; its fields begin with the number of the request that is refused, as `requests[3].track_set.xs`.
     pub async fn create_batch(
         &mut self,
         inputs: impl Iterator<Item = &RawInput>,

@@ -5,8 +5,7 @@ use tonic::Request;
 
 use super::backoff::Backoff;
 use super::jobs::{EventFollower, JobOptions, create_request, ended};
-use super::{Client, Error, Outgoing};
-use crate::cli::args::ServerArgs;
+use super::{Client, Error, InputData};
 use crate::domain::job::JobEvent;
 use crate::domain::{Solution, SolveSettings};
 use crate::rpc::proto;
@@ -18,7 +17,7 @@ impl Client {
     /// See [`Error`]; a job that ended without a result is an error here.
     pub async fn solve(
         &mut self,
-        input: impl Into<Outgoing>,
+        input: impl Into<InputData>,
         settings: &SolveSettings,
         on_event: &mut (dyn FnMut(&JobEvent) + Send),
         stop: CancellationToken,
@@ -36,7 +35,7 @@ impl Client {
                 if let Some(name) = &name {
                     self.cancel(name).await?;
                 }
-                return Err(Error::Cancelled);
+                return Err(Error::cancelled());
             }
         };
         ended(&last)?;
@@ -47,7 +46,7 @@ impl Client {
     /// tells its events anew, of which only new ones are passed on.
     async fn follow_solve(
         &mut self,
-        input: &Outgoing,
+        input: &InputData,
         settings: &SolveSettings,
         on_event: &mut (dyn FnMut(&JobEvent) + Send),
     ) -> Result<JobEvent, Error> {
@@ -64,23 +63,9 @@ impl Client {
             };
             match outcome {
                 Ok(Some(last)) => return Ok(last),
-                Ok(None) => return Err(Error::Failed("the server ended a solve without its last event".into())),
+                Ok(None) => return Err(Error::failed("the server ended a solve without its last event")),
                 Err(status) => self.pause(&mut backoff, status).await?,
             }
         }
     }
-}
-
-/// Runs one job on a server: what `scpsfm solve --server` and `scpsfm demo` do. See [`Client::solve`].
-///
-/// # Errors
-/// See [`Error`].
-pub async fn solve(
-    server: &ServerArgs,
-    input: impl Into<Outgoing>,
-    settings: &SolveSettings,
-    on_event: &mut (dyn FnMut(&JobEvent) + Send),
-    stop: CancellationToken,
-) -> Result<Solution, Error> {
-    server.connect().await?.solve(input, settings, on_event, stop).await
 }

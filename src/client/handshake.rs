@@ -1,80 +1,82 @@
 //! What went wrong with a TLS handshake, in words of what to do about it.
 
-use std::error::Error;
+use std::error::Error as StdError;
 use std::io;
 
 use tokio_rustls::rustls::{self, AlertDescription, CertificateError};
 
+use super::error::{Error, ErrorKind};
+use super::options::Setting;
+
 /// Why a connection to `server` could not be trusted; `None` for any other trouble.
-pub(super) fn words(server: &str, error: &(dyn Error + 'static)) -> Option<String> {
+pub(super) fn error(server: &str, error: &(dyn StdError + 'static)) -> Option<Error> {
     let mut cause = Some(error);
     while let Some(here) = cause {
-        if let Some(words) = rustls_error(here).and_then(|error| of_handshake(server, error)) {
-            return Some(words);
-        }
         // What arrives after the handshake has gone through layers that keep no more than its text.
-        if let Some(words) = of_alert_text(server, &here.to_string()) {
-            return Some(words);
+        let found = rustls_error(here).and_then(of_handshake).or_else(|| of_alert_text(&here.to_string()));
+        if let Some((words, setting)) = found {
+            return Some(Error { setting, ..ErrorKind::NotLetIn.error(format!("{server}: {words}")) });
         }
         cause = here.source();
     }
     None
 }
 
+/// What went wrong, and what would help.
+type Found = (String, Option<Setting>);
+
 /// rustls' own error, which an I/O error holds without calling it its source.
-fn rustls_error<'a>(error: &'a (dyn Error + 'static)) -> Option<&'a rustls::Error> {
+fn rustls_error<'a>(error: &'a (dyn StdError + 'static)) -> Option<&'a rustls::Error> {
     let inner = error.downcast_ref::<io::Error>().and_then(io::Error::get_ref);
     error.downcast_ref().or_else(|| inner?.downcast_ref())
 }
 
-fn of_handshake(server: &str, error: &rustls::Error) -> Option<String> {
+fn of_handshake(error: &rustls::Error) -> Option<Found> {
     use CertificateError::{
         Expired, ExpiredContext, NotValidForName, NotValidForNameContext, NotValidYet, NotValidYetContext,
         UnknownIssuer,
     };
-    let text = match error {
-        rustls::Error::InvalidCertificate(UnknownIssuer) => format!(
-            "{server}: no authority that is trusted here has signed the server's certificate; --tls-ca FILE names others"
-        ),
-        rustls::Error::InvalidCertificate(NotValidForName | NotValidForNameContext { .. }) => format!(
-            "{server}: the server's certificate is for another name than that of this address; --server must use one of \
-             its names"
-        ),
+    let words = match error {
+        rustls::Error::InvalidCertificate(UnknownIssuer) => {
+            let words = "no authority that is trusted here has signed the server's certificate; `tls_ca` names others";
+            return Some((words.into(), Some(Setting::TlsCa)));
+        }
+        rustls::Error::InvalidCertificate(NotValidForName | NotValidForNameContext { .. }) => {
+            "the server's certificate is for another name than that of this address, which must use one of its names"
+                .into()
+        }
         rustls::Error::InvalidCertificate(
             Expired | ExpiredContext { .. } | NotValidYet | NotValidYetContext { .. },
-        ) => {
-            format!(
-                "{server}: the server's certificate has expired or is not valid yet, or this machine's clock is wrong"
-            )
-        }
+        ) => "the server's certificate has expired or is not valid yet, or this machine's clock is wrong".into(),
         // What `openssl req -x509` makes when it is told nothing else; the error has no type of its own.
-        rustls::Error::InvalidCertificate(other) if format!("{other:?}").contains("CaUsedAsEndEntity") => format!(
-            "{server}: the server's certificate is one of an authority (CA:TRUE) and not of a server; make it with \
+        rustls::Error::InvalidCertificate(other) if format!("{other:?}").contains("CaUsedAsEndEntity") => {
+            "the server's certificate is one of an authority (CA:TRUE) and not of a server; make it with \
              basicConstraints=CA:FALSE"
-        ),
-        rustls::Error::InvalidCertificate(other) => format!("{server}: the server's certificate is not right: {other}"),
-        rustls::Error::InvalidMessage(_) => {
-            format!("{server}: the server does not speak TLS there; http:// is for one without")
+                .into()
         }
-        rustls::Error::AlertReceived(alert) => of_alert(server, *alert),
+        rustls::Error::InvalidCertificate(other) => format!("the server's certificate is not right: {other}"),
+        rustls::Error::InvalidMessage(_) => "the server does not speak TLS there; http:// is for one without".into(),
+        rustls::Error::AlertReceived(alert) => return Some(of_alert(*alert)),
         _ => return None,
     };
-    Some(text)
+    Some((words, None))
 }
 
-fn of_alert(server: &str, alert: AlertDescription) -> String {
+fn of_alert(alert: AlertDescription) -> Found {
     match alert {
         AlertDescription::CertificateRequired => {
-            format!("{server}: the server asks for a client's certificate: --tls-cert and --tls-key")
+            let words = "the server asks for a client's certificate; `tls_cert` says which to show";
+            (words.into(), Some(Setting::TlsCert))
         }
         AlertDescription::UnknownCA
         | AlertDescription::BadCertificate
         | AlertDescription::CertificateUnknown
         | AlertDescription::CertificateExpired
         | AlertDescription::DecryptError => {
-            format!("{server}: the server does not trust the client's certificate (--tls-cert): {alert:?}")
+            let words = format!("the server does not trust the client's certificate (`tls_cert`): {alert:?}");
+            (words, Some(Setting::TlsCert))
         }
-        other => format!("{server}: the server broke off the TLS handshake: {other:?}"),
+        other => (format!("the server broke off the TLS handshake: {other:?}"), None),
     }
 }
 
@@ -90,7 +92,7 @@ pub(super) fn plain_hint(server: &str, cause: &str) -> &'static str {
 }
 
 /// Alerts whose text may come without their type, as rustls writes them.
-fn of_alert_text(server: &str, text: &str) -> Option<String> {
+fn of_alert_text(text: &str) -> Option<Found> {
     let (_, alert) = text.split_once("received fatal alert: ")?;
     let known = [
         AlertDescription::CertificateRequired,
@@ -101,7 +103,7 @@ fn of_alert_text(server: &str, text: &str) -> Option<String> {
         AlertDescription::DecryptError,
     ];
     let alert = known.into_iter().find(|known| alert.contains(&format!("{known:?}")))?;
-    Some(of_alert(server, alert))
+    Some(of_alert(alert))
 }
 
 #[cfg(test)]
@@ -118,12 +120,13 @@ mod tests {
 
     #[test]
     fn an_error_is_found_wherever_it_is_wrapped() {
+        let setting = |cause: io::Error| error("https://a", &cause).map(|error| error.setting);
         let refused = rustls::Error::InvalidCertificate(CertificateError::UnknownIssuer);
         let wrapped = io::Error::new(io::ErrorKind::InvalidData, refused);
-        assert!(words("https://a", &wrapped).is_some_and(|words| words.contains("--tls-ca")));
+        assert_eq!(setting(wrapped), Some(Some(Setting::TlsCa)));
         // As text: what the transport makes of it later.
         let alert = rustls::Error::AlertReceived(AlertDescription::CertificateRequired).to_string();
-        assert!(words("https://a", &io::Error::other(alert)).is_some_and(|words| words.contains("--tls-cert ")));
-        assert_eq!(words("https://a", &io::Error::other("connection refused")), None);
+        assert_eq!(setting(io::Error::other(alert)), Some(Some(Setting::TlsCert)));
+        assert_eq!(setting(io::Error::other("connection refused")), None);
     }
 }

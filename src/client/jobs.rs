@@ -9,7 +9,7 @@ use sha2::{Digest, Sha256};
 use tonic::{Status, Streaming};
 
 use super::backoff::Backoff;
-use super::{Client, Error, Outgoing};
+use super::{Client, Error, InputData};
 use crate::domain::job::{EventBody, Failure, Job, JobEvent, JobName, JobState};
 use crate::domain::{InputName, Solution, SolveSettings};
 use crate::rpc::convert;
@@ -18,18 +18,24 @@ use crate::rpc::proto::{self, create_job_request::Source as JobInput};
 /// What a caller says of a job beside input and settings.
 #[derive(Debug, Clone, Default)]
 pub struct JobOptions {
+    /// Last part of the job's name; `None`: the server chooses one.
     pub job_id: Option<String>,
-    /// `None`: one is made, so that a broken call can be repeated.
+    /// The same id and job give the same job; `None`: one is made, so that a broken call can be repeated.
     pub request_id: Option<String>,
+    /// Marks to find the job by.
     pub labels: BTreeMap<String, String>,
+    /// Larger is sooner, among the jobs of the tenant.
     pub priority: i32,
+    /// Time after which a job without a result ends.
     pub time_limit: Option<Duration>,
+    /// Where the server sends the job's end.
     pub webhook_url: Option<String>,
 }
 
 /// One page of a list.
 #[derive(Debug)]
 pub struct Page {
+    /// The newest first.
     pub jobs: Vec<Job>,
     /// Empty on the last page.
     pub next_page_token: String,
@@ -42,7 +48,7 @@ impl Client {
     /// See [`Error`].
     pub async fn create(
         &mut self,
-        input: impl Into<Outgoing>,
+        input: impl Into<InputData>,
         settings: &SolveSettings,
         options: JobOptions,
     ) -> Result<Job, Error> {
@@ -78,8 +84,10 @@ impl Client {
         }
     }
 
+    /// A job as it stands.
+    ///
     /// # Errors
-    /// See [`Error`].
+    /// See [`Error`]; [`ErrorKind::Refused`](super::ErrorKind::Refused) where there is none of this name.
     pub async fn get(&mut self, name: &JobName) -> Result<Job, Error> {
         let request = proto::GetJobRequest { name: name.to_string() };
         let job = self.call(request, |mut client, request| async move { client.jobs.get_job(request).await });
@@ -104,6 +112,9 @@ impl Client {
         Ok(Page { jobs, next_page_token: page.next_page_token })
     }
 
+    /// Cancels a job: one that waits at once, one that runs soon; one that has ended stays as it is. Returns it as it
+    /// stands then.
+    ///
     /// # Errors
     /// See [`Error`].
     pub async fn cancel(&mut self, name: &JobName) -> Result<Job, Error> {
@@ -115,7 +126,7 @@ impl Client {
     /// Puts a job that ended without a result into the queue again.
     ///
     /// # Errors
-    /// See [`Error`]; [`Error::Refused`] for one that has succeeded.
+    /// See [`Error`]; [`ErrorKind::Refused`](super::ErrorKind::Refused) for one that has succeeded.
     pub async fn retry(&mut self, name: &JobName) -> Result<Job, Error> {
         let request = proto::RetryJobRequest { name: name.to_string(), etag: String::new() };
         let job = self.call(request, |mut client, request| async move { client.jobs.retry_job(request).await });
@@ -125,7 +136,7 @@ impl Client {
     /// Changes the priority of a job that waits.
     ///
     /// # Errors
-    /// See [`Error`]; [`Error::Refused`] for one that does not wait.
+    /// See [`Error`]; [`ErrorKind::Refused`](super::ErrorKind::Refused) for one that does not wait.
     pub async fn set_priority(&mut self, name: &JobName, priority: i32) -> Result<Job, Error> {
         let request =
             proto::SetJobPriorityRequest { name: name.to_string(), priority: Some(priority), etag: String::new() };
@@ -136,7 +147,7 @@ impl Client {
     /// Removes a job that has ended.
     ///
     /// # Errors
-    /// See [`Error`]; [`Error::Refused`] for one that has not ended.
+    /// See [`Error`]; [`ErrorKind::Refused`](super::ErrorKind::Refused) for one that has not ended.
     pub async fn delete(&mut self, name: &JobName) -> Result<(), Error> {
         let request = proto::DeleteJobRequest { name: name.to_string(), etag: String::new() };
         self.call(request, |mut client, request| async move { client.jobs.delete_job(request).await }).await
@@ -173,7 +184,7 @@ impl Client {
     /// Reads a result.
     ///
     /// # Errors
-    /// See [`Error`]; [`Error::Refused`] while there is none.
+    /// See [`Error`]; [`ErrorKind::Refused`](super::ErrorKind::Refused) while there is none.
     pub async fn read_result(&mut self, name: &JobName) -> Result<Solution, Error> {
         let mut bytes = Vec::new();
         let mut backoff = Backoff::default();
@@ -184,10 +195,10 @@ impl Client {
             }
         };
         if Sha256::digest(&bytes)[..] != sha256[..] {
-            return Err(Error::Failed("the result is not what the server stored: read it again".into()));
+            return Err(Error::failed("the result is not what the server stored: read it again"));
         }
         let result = proto::JobResult::decode(bytes.as_slice())
-            .map_err(|error| Error::Failed(format!("the server's result cannot be decoded: {error}")))?;
+            .map_err(|error| Error::failed(format!("the server's result cannot be decoded: {error}")))?;
         Ok(convert::result::from_wire(result)?)
     }
 
@@ -213,10 +224,10 @@ impl Client {
                 }
                 Ok(Some(chunk)) => {
                     let text = format!("a chunk begins at {} where {} was due", chunk.offset, bytes.len());
-                    return Err(Error::Failed(text));
+                    return Err(Error::failed(text));
                 }
                 Ok(None) if total == bytes.len() as i64 => return Ok(Ok(sha256)),
-                Ok(None) => return Err(Error::Failed(format!("the result ended at {} of {total}", bytes.len()))),
+                Ok(None) => return Err(Error::failed(format!("the result ended at {} of {total}", bytes.len()))),
                 Err(status) => return Ok(Err(status)),
             }
         }
@@ -264,11 +275,12 @@ impl EventFollower<'_> {
 /// `Ok` when a job's last event says that its result stands.
 ///
 /// # Errors
-/// [`Error::Cancelled`], or [`Error::Failed`] with the reason.
+/// [`ErrorKind::Cancelled`](super::ErrorKind::Cancelled), or [`ErrorKind::Failed`](super::ErrorKind::Failed) with the
+/// reason.
 pub fn ended(last: &JobEvent) -> Result<(), Error> {
     match &last.body {
         EventBody::State { state, failure } => ended_as(&last.job, *state, failure.as_ref()),
-        _ => Err(Error::Failed(format!("{} did not succeed", last.job))),
+        _ => Err(Error::failed(format!("{} did not succeed", last.job))),
     }
 }
 
@@ -279,12 +291,12 @@ pub fn ended(last: &JobEvent) -> Result<(), Error> {
 pub fn ended_as(name: &JobName, state: JobState, failure: Option<&Failure>) -> Result<(), Error> {
     match (state, failure) {
         (JobState::Succeeded, _) => Ok(()),
-        (JobState::Cancelled, _) => Err(Error::Cancelled),
+        (JobState::Cancelled, _) => Err(Error::cancelled()),
         (JobState::DeadlineExceeded, _) => {
-            Err(Error::Failed(format!("{name} exceeded its deadline before a result stood")))
+            Err(Error::failed(format!("{name} exceeded its deadline before a result stood")))
         }
-        (_, Some(failure)) => Err(Error::Failed(format!("{name} failed: {} ({})", failure.message, failure.reason))),
-        _ => Err(Error::Failed(format!("{name} did not succeed"))),
+        (_, Some(failure)) => Err(Error::failed(format!("{name} failed: {} ({})", failure.message, failure.reason))),
+        _ => Err(Error::failed(format!("{name} did not succeed"))),
     }
 }
 

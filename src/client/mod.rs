@@ -1,24 +1,46 @@
-//! The client side of the API: what every command that talks to a server shares.
+//! A client of the API, as a library: connects, creates jobs, watches them, reads results, uploads inputs.
 //!
-//! Calls that may be repeated are repeated when the connection breaks, for a bounded time: a watch goes on after its
-//! last event, a result after its last byte, a creation under its request id. Every call is repeated where a rate refused
-//! it, after the time that the server tells.
+//! ```no_run
+//! use scpsfm::client::{Client, JobOptions, Options, ended};
+//! use scpsfm::domain::{RawInput, Solution, SolveSettings};
 //!
-//! Here is the connection; its calls are in files of their own.
+//! async fn solve(input: &RawInput) -> Result<Solution, scpsfm::client::Error> {
+//!     let mut client = Client::connect("http://127.0.0.1:50051", &Options::default()).await?;
+//!     let job = client.create(input, &SolveSettings::default(), JobOptions::default()).await?;
+//!     let last = client.watch(&job.name, 0, &mut |event| println!("{event:?}")).await?;
+//!     last.as_ref().map_or(Ok(()), ended)?;
+//!     client.read_result(&job.name).await
+//! }
+//! ```
+//!
+//! [`Client::solve`] does all of this in one call, and cancels the job when it is told to stop.
+//!
+//! # Retries
+//!
+//! Where the connection breaks or the server goes down, these go on for up to [`MAX_WAIT`], with pauses that grow from
+//! a tenth of a second to five seconds: a creation under its request id, a watch after its last event, a result after
+//! its last byte, an upload after what the server has. Other calls fail at once with [`ErrorKind::Unavailable`]. Every
+//! call is repeated where a rate refused it, after the time that the server tells. [`Client::on_wait`] hears of waits.
+//!
+//! # Dependence
+//!
+//! Depends on `domain`, and on `rpc` for the messages and their conversion; the command line is one of its users. Here is
+//! the connection; its calls are in files of their own.
 
-pub mod access;
 mod admin;
 mod answered;
 mod backoff;
 mod batch;
 mod error;
 mod handshake;
+mod input_data;
 mod jobs;
-mod outgoing;
+mod options;
 mod solve;
-pub mod upload;
+mod upload;
 mod uploaded_inputs;
 
+use std::fmt;
 use std::future::Future;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
@@ -29,14 +51,16 @@ use tonic::service::interceptor::InterceptedService;
 use tonic::transport::{Channel, Endpoint};
 use tonic::{Response, Status};
 
-pub use error::Error;
+pub use error::{Error, ErrorKind};
+pub use input_data::InputData;
 pub use jobs::{JobOptions, Page, ended, ended_as};
-pub use outgoing::Outgoing;
-pub use solve::solve;
+pub use options::{ApiKey, Options, Setting};
+pub use upload::EncodedInput;
+pub use uploaded_inputs::InputPage;
 
-use self::access::{AccessArgs, Bearer};
 use self::answered::Answered;
 use self::backoff::Backoff;
+use self::options::Bearer;
 use crate::rpc::proto::admin_service_client::AdminServiceClient;
 use crate::rpc::proto::calibration_service_client::CalibrationServiceClient;
 use crate::rpc::proto::input_service_client::InputServiceClient;
@@ -48,6 +72,9 @@ const CONNECT_TIMEOUT: Duration = Duration::from_secs(5);
 /// A silent connection is asked this often whether it lives, so that a watch of a long job notices a lost server.
 const KEEPALIVE: Duration = Duration::from_secs(20);
 
+/// How long a client goes on where a connection breaks or a rate refuses a call, tries and pauses together.
+pub const MAX_WAIT: Duration = Backoff::TOTAL;
+
 /// A rate that lets the call pass sooner than this is waited for without a word: a list of many pages may meet it at
 /// every page.
 const SILENT_WAIT: Duration = Duration::from_secs(1);
@@ -58,8 +85,11 @@ const MAX_MESSAGE_BYTES: usize = 64 << 20;
 /// A connection whose every call carries the API key, where there is one.
 type Keyed = InterceptedService<Answered<Channel>, Bearer>;
 
-/// A connection to a server; reconnects by itself.
-#[derive(Debug, Clone)]
+/// What hears of waits.
+type OnWait = Arc<dyn Fn(&Error) + Send + Sync>;
+
+/// A connection to a server; reconnects by itself. A clone shares the connection.
+#[derive(Clone)]
 pub struct Client {
     jobs: JobServiceClient<Keyed>,
     calibration: CalibrationServiceClient<Keyed>,
@@ -72,36 +102,43 @@ pub struct Client {
     tenant: String,
     /// Whether the caller said so; it is the default one otherwise.
     is_tenant_given: bool,
+    on_wait: Option<OnWait>,
+}
+
+impl fmt::Debug for Client {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.debug_struct("Client").field("server", &self.server).field("tenant", &self.tenant).finish_non_exhaustive()
+    }
 }
 
 impl Client {
-    /// Connects.
+    /// Connects to `http://HOST:PORT` or `https://HOST:PORT`.
     ///
     /// # Errors
-    /// [`Error::Unavailable`] where no server answers, [`Error::NotLetIn`] where one side does not trust the other,
-    /// [`Error::Usage`] for what is not a URL and for files of certificates or keys that cannot be used.
-    pub async fn connect(server: &str, access: &AccessArgs) -> Result<Self, Error> {
+    /// [`ErrorKind::Unavailable`] where no server answers, [`ErrorKind::NotLetIn`] where one side does not trust the
+    /// other, [`ErrorKind::Usage`] for what is not a URL and for files of certificates or keys that cannot be used.
+    pub async fn connect(server: &str, options: &Options) -> Result<Self, Error> {
         if server.contains('@') {
             // Not repeated: what stands there may be a password.
-            return Err(Error::Usage(
-                "the server's address holds a user or a password (`@`), which no server asks for: an API key goes into \
-                 --api-key-file or SCPSFM_API_KEY"
-                    .into(),
-            ));
+            let words = "the server's address holds a user or a password (`@`), which no server asks for: an API key \
+                         goes into `api_key`";
+            return Err(ErrorKind::Usage.error(words).about(Setting::ApiKey));
         }
-        let no_url =
-            || Error::Usage(format!("{server:?} is not a URL of the form http://HOST:PORT or https://HOST:PORT"));
+        let no_url = || {
+            let words = format!("{server:?} is not a URL of the form http://HOST:PORT or https://HOST:PORT");
+            ErrorKind::Usage.error(words).about(Setting::Server)
+        };
         if !server.starts_with("http://") && !server.starts_with("https://") {
             return Err(no_url());
         }
-        let tenant = access.tenant()?;
+        let tenant = options.tenant()?.to_owned();
         let endpoint = Endpoint::from_shared(server.to_owned())
             .map_err(|_| no_url())?
             .connect_timeout(CONNECT_TIMEOUT)
             .tcp_nodelay(true)
             .http2_keep_alive_interval(KEEPALIVE);
-        let bearer = access.bearer(&endpoint)?;
-        let endpoint = access.secure(endpoint)?;
+        let bearer = options.bearer(&endpoint)?;
+        let endpoint = options.secure(endpoint)?;
         let channel = endpoint.connect().await.map_err(|error| error::not_connected(server, &error))?;
         let answered = Arc::new(AtomicBool::new(false));
         let channel = InterceptedService::new(Answered::new(channel, Arc::clone(&answered)), bearer);
@@ -119,8 +156,15 @@ impl Client {
             server: server.to_owned(),
             answered,
             tenant,
-            is_tenant_given: access.tenant.is_some(),
+            is_tenant_given: options.tenant.is_some(),
+            on_wait: None,
         })
+    }
+
+    /// Has `on_wait` called when a call is going to be repeated for up to [`MAX_WAIT`], with what is wrong: once each
+    /// trouble, as half a minute of silence looks like a hang.
+    pub fn on_wait(&mut self, on_wait: impl Fn(&Error) + Send + Sync + 'static) {
+        self.on_wait = Some(Arc::new(on_wait));
     }
 
     /// The server's address, as it was given.
@@ -133,8 +177,8 @@ impl Client {
     }
 
     fn error(&self, status: Status) -> Error {
-        let own_words = Error::from_status(&self.server, &status, self.answered.load(Ordering::Relaxed));
-        if self.is_tenant_given { own_words } else { own_words.or_no_tenant(&status) }
+        let error = Error::from_status(&self.server, &status, self.answered.load(Ordering::Relaxed));
+        if self.is_tenant_given { error } else { error.or_no_tenant() }
     }
 
     /// Makes a call, and makes it again where a rate of calls or jobs refused it. For any other trouble it does not wait.
@@ -152,17 +196,18 @@ impl Client {
         }
     }
 
-    /// Waits before another try, or gives up: for good reason, or after too many. Says so once each trouble, on stderr:
-    /// half a minute of silence looks like a hang.
+    /// Waits before another try, or gives up: for good reason, or after too many. Says so once each trouble.
     async fn pause(&self, backoff: &mut Backoff, status: Status) -> Result<(), Error> {
         let wait = error::rate_limit_wait(&status);
         let transient = wait.is_some() || error::is_transient(&status);
         let first = transient && backoff.failed(&status);
-        if first && wait.is_none_or(|wait| (SILENT_WAIT..Backoff::TOTAL).contains(&wait)) {
+        if first
+            && wait.is_none_or(|wait| (SILENT_WAIT..MAX_WAIT).contains(&wait))
+            && let Some(on_wait) = &self.on_wait
+        {
             // Whether it is the right server can be asked once it has gone on for so long: one that is ended breaks
             // connections in the same way.
-            let trouble = Error::from_status(&self.server, &status, true);
-            tell!("waiting up to {} s: {trouble}", Backoff::TOTAL.as_secs());
+            on_wait(&Error::from_status(&self.server, &status, true));
         }
         let error = self.error(status);
         if transient && backoff.pause(wait.unwrap_or_default()).await {

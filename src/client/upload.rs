@@ -10,7 +10,7 @@ use tonic::{Request, Status};
 use tonic_types::StatusExt as _;
 
 use super::backoff::Backoff;
-use super::{Client, Error, Outgoing, error};
+use super::{Client, Error, InputData, error};
 use crate::domain::InputName;
 use crate::rpc::proto::{self, upload_input_request::Message};
 
@@ -22,13 +22,14 @@ const TELL_EVERY: Duration = Duration::from_millis(100);
 
 /// An input in the form in which it is uploaded.
 #[derive(Debug, Clone)]
-pub struct Encoded {
+pub struct EncodedInput {
     bytes: Bytes,
     sha256: [u8; 32],
 }
 
-impl Encoded {
-    pub fn new(input: impl Into<Outgoing>) -> Self {
+impl EncodedInput {
+    /// Encodes an input and takes its digest.
+    pub fn new(input: impl Into<InputData>) -> Self {
         let data = input.into().into_data();
         let bytes: Bytes = proto::InputData { data: Some(data) }.encode_to_vec().into();
         let sha256 = Sha256::digest(&bytes).into();
@@ -40,6 +41,7 @@ impl Encoded {
         self.bytes.len() as u64
     }
 
+    /// Whether it has no bytes, as no valid input has.
     pub fn is_empty(&self) -> bool {
         self.bytes.is_empty()
     }
@@ -89,7 +91,7 @@ impl Client {
     /// See [`Error`].
     pub async fn upload(
         &mut self,
-        input: &Encoded,
+        input: &EncodedInput,
         on_progress: &mut (dyn FnMut(u64) + Send),
     ) -> Result<InputName, Error> {
         let mut backoff = Backoff::default();
@@ -98,7 +100,7 @@ impl Client {
             let trouble = match self.upload_on(input, &mut best, &mut backoff, on_progress).await {
                 Ok(stored) => {
                     on_progress(input.len());
-                    let unknown = || Error::Failed(format!("the server calls the input {:?}", stored.name));
+                    let unknown = || Error::failed(format!("the server calls the input {:?}", stored.name));
                     return InputName::parse(&stored.name).ok_or_else(unknown);
                 }
                 Err(status) => status,
@@ -111,7 +113,7 @@ impl Client {
     /// One try, from where the server is.
     async fn upload_on(
         &mut self,
-        input: &Encoded,
+        input: &EncodedInput,
         best: &mut u64,
         backoff: &mut Backoff,
         on_progress: &mut (dyn FnMut(u64) + Send),
@@ -169,7 +171,7 @@ mod tests {
             depth: Vec::new(),
             sigma: Vec::new(),
         };
-        let id = |x| Encoded::new(&raw(x)).upload_id();
+        let id = |x| EncodedInput::new(raw(x)).upload_id();
         assert_eq!(id(1.0), id(1.0));
         assert_ne!(id(1.0), id(1.5));
         let parsed = uuid::Uuid::try_parse(&id(1.0)).expect("a UUID");

@@ -1,0 +1,142 @@
+//! The flags on the access to a server.
+
+use std::path::PathBuf;
+
+use clap::Args;
+
+use super::exit::Failure;
+use crate::client::{ApiKey, Options, Setting};
+
+/// The variable that may hold the API key. No flag does: other users of the machine see flags.
+const KEY_VARIABLE: &str = "SCPSFM_API_KEY";
+
+/// Heading of the flags that say who calls. Given flag by flag: set for the whole, it would go on to flags of the
+/// command.
+const ACCESS: &str = "Access to the server";
+
+/// Who calls, and whom to trust.
+#[derive(Debug, Clone, Default, Args)]
+pub struct AccessArgs {
+    /// Tenant whose jobs these are [default: default]
+    #[arg(long, help_heading = ACCESS, value_name = "ID", env = "SCPSFM_TENANT")]
+    pub tenant: Option<String>,
+
+    /// File with the API key; without it, the variable SCPSFM_API_KEY
+    #[arg(long, help_heading = ACCESS, value_name = "FILE")]
+    pub api_key_file: Option<PathBuf>,
+
+    /// Authorities that the server's certificate must lead to (PEM) [default: those of the system]
+    #[arg(long, help_heading = ACCESS, value_name = "FILE")]
+    pub tls_ca: Option<PathBuf>,
+
+    /// Certificate to show to a server that asks for one (PEM)
+    #[arg(long, help_heading = ACCESS, value_name = "FILE", requires = "tls_key")]
+    pub tls_cert: Option<PathBuf>,
+
+    /// Private key of that certificate (PEM)
+    #[arg(long, help_heading = ACCESS, value_name = "FILE", requires = "tls_cert")]
+    pub tls_key: Option<PathBuf>,
+
+    /// Send the API key to another machine without TLS: whoever listens in has it
+    #[arg(long, help_heading = ACCESS)]
+    pub plaintext_keys: bool,
+}
+
+impl AccessArgs {
+    /// Whether anything was said that has no meaning without a server.
+    pub fn is_given(&self) -> bool {
+        self.api_key_file.is_some() || self.tls_ca.is_some() || self.tls_cert.is_some() || self.plaintext_keys
+    }
+
+    /// The tenant.
+    ///
+    /// # Errors
+    /// For what is no tenant's id, as wrong usage.
+    pub fn tenant(&self) -> Result<String, Failure> {
+        let options = Options { tenant: self.tenant.clone(), ..Options::default() };
+        Ok(options.tenant()?.to_owned())
+    }
+
+    /// The same for the client.
+    ///
+    /// # Errors
+    /// For a key that cannot be read or is none, as wrong usage.
+    pub fn options(&self) -> Result<Options, Failure> {
+        Ok(Options {
+            tenant: self.tenant.clone(),
+            api_key: self.api_key()?,
+            tls_ca: self.tls_ca.clone(),
+            tls_cert: self.tls_cert.clone(),
+            tls_key: self.tls_key.clone(),
+            plaintext_keys: self.plaintext_keys,
+        })
+    }
+
+    /// The key, from the file or the environment.
+    fn api_key(&self) -> Result<Option<ApiKey>, Failure> {
+        let (source, text) = match &self.api_key_file {
+            Some(path) => {
+                let source = format!("--api-key-file: {}", path.display());
+                let text = std::fs::read_to_string(path);
+                (source.clone(), text.map_err(|error| Failure::usage(format_args!("{source}: {error}")))?)
+            }
+            None => match std::env::var(KEY_VARIABLE) {
+                Ok(text) if !text.is_empty() => (KEY_VARIABLE.to_owned(), text),
+                Err(std::env::VarError::NotUnicode(_)) => {
+                    return Err(Failure::usage(format_args!("{KEY_VARIABLE} holds no text")));
+                }
+                _ => return Ok(None),
+            },
+        };
+        let key = ApiKey::new(text.trim());
+        key.map(Some).map_err(|error| Failure::usage(with_name(&error.message, Setting::ApiKey, &source)))
+    }
+}
+
+/// Where a setting comes from on the command line.
+fn flag(setting: Setting) -> &'static str {
+    match setting {
+        Setting::Server => "--server",
+        Setting::Tenant => "--tenant or SCPSFM_TENANT",
+        Setting::ApiKey => "--api-key-file or SCPSFM_API_KEY",
+        Setting::TlsCa => "--tls-ca",
+        Setting::TlsCert => "--tls-cert",
+        Setting::TlsKey => "--tls-key",
+        Setting::PlaintextKeys => "--plaintext-keys",
+    }
+}
+
+/// A message of the client with the flag in the place of its setting.
+pub fn with_flag(message: &str, setting: Setting) -> String {
+    with_name(message, setting, flag(setting))
+}
+
+fn with_name(message: &str, setting: Setting, name: &str) -> String {
+    message.replacen(&format!("`{}`", setting.name()), name, 1)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::cli::exit::Exit;
+
+    #[test]
+    fn a_file_without_a_key_is_named_and_its_content_is_not() {
+        let directory = tempfile::tempdir().expect("a temporary directory");
+        let path = directory.path().join("key");
+        std::fs::write(&path, "hunter2\n").expect("written");
+        let access = AccessArgs { api_key_file: Some(path.clone()), ..AccessArgs::default() };
+        let failure = access.options().expect_err("too short");
+        assert_eq!(failure.exit, Exit::Usage);
+        let begin = format!("--api-key-file: {} has a key of fewer than", path.display());
+        assert!(failure.message.starts_with(&begin) && !failure.message.contains("hunter2"), "{failure}");
+    }
+
+    #[test]
+    fn what_is_no_tenant_is_told_by_its_flag() {
+        let access = AccessArgs { tenant: Some("North".into()), ..AccessArgs::default() };
+        let failure = access.tenant().expect_err("capitals");
+        assert_eq!(failure.exit, Exit::Usage);
+        assert!(failure.message.starts_with("--tenant or SCPSFM_TENANT \"North\" is not"), "{failure}");
+    }
+}
