@@ -29,5 +29,5 @@ pub mod rpc;
 pub mod store;
 pub mod telemetry;
 
-pub(crate) use scpsfm_core::{geometry, parallel, training};
+pub(crate) use scpsfm_core::{matrix_of_cameras, parallel, statistics, training};
 pub use scpsfm_core::{solver, synthetic};

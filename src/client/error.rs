@@ -15,6 +15,7 @@ use crate::domain::{InvalidInput, Violation};
 /// Why a call came to nothing: a sentence for people, the rest for programs.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 #[error("{message}")]
+#[non_exhaustive]
 pub struct Error {
     pub kind: ErrorKind,
     /// The sentence; a field of [`Options`](super::Options) stands in backquotes.
@@ -31,6 +32,7 @@ pub struct Error {
 
 /// What a caller can do about an error.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
+#[non_exhaustive]
 pub enum ErrorKind {
     /// No server answers, it is going down, or its queue is full: another try may help.
     Unavailable,

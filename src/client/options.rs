@@ -32,13 +32,21 @@ pub struct Options {
 
 /// What an error is about: the server's address, or a field of [`Options`].
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
+#[non_exhaustive]
 pub enum Setting {
+    /// The address.
     Server,
+    /// [`Options::tenant`].
     Tenant,
+    /// [`Options::api_key`].
     ApiKey,
+    /// [`Options::tls_ca`].
     TlsCa,
+    /// [`Options::tls_cert`].
     TlsCert,
+    /// [`Options::tls_key`].
     TlsKey,
+    /// [`Options::plaintext_keys`].
     PlaintextKeys,
 }
 
@@ -102,7 +110,8 @@ impl Options {
     /// [`ErrorKind::Usage`] for files that cannot be used, or that have no meaning for `http://`.
     pub(super) fn secure(&self, endpoint: Endpoint) -> Result<Endpoint, Error> {
         if endpoint.uri().scheme_str() != Some("https") {
-            let useless = [(&self.tls_ca, Setting::TlsCa), (&self.tls_cert, Setting::TlsCert)];
+            let useless =
+                [(&self.tls_ca, Setting::TlsCa), (&self.tls_cert, Setting::TlsCert), (&self.tls_key, Setting::TlsKey)];
             return match useless.into_iter().find(|(file, _)| file.is_some()) {
                 Some((_, setting)) => Err(setting.error("needs a server with https://")),
                 None => Ok(endpoint),

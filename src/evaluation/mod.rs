@@ -5,7 +5,7 @@
 //! records, [`figures`] and [`page`] show them; [`priors`] compares what the search starts from; [`observations`] are
 //! inputs that need verdicts on single observations, [`photographed`] those among them that are as people photograph;
 //! [`real`] holds this program beside another one on real sequences. The scores are those of
-//! [`scpsfm_core::evaluation`]. May depend on it, `solver`, `synthetic`, `geometry`, `formats`, `report` and `domain`;
+//! [`scpsfm_core::evaluation`]. May depend on it, `solver`, `synthetic`, `statistics`, `formats`, `report` and `domain`;
 //! knows nothing of jobs or transport.
 
 pub mod figures;

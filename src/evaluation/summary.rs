@@ -7,7 +7,7 @@ use serde::Serialize;
 use super::plan::{Contestant, Depths, Plan, Run};
 use super::runner::Records;
 use crate::domain::Grade;
-use crate::geometry::statistics::midpoint_median;
+use crate::statistics::midpoint_median;
 use crate::synthetic::{Motion, SceneOptions, Shape};
 use scpsfm_core::evaluation::measures::Measures;
 

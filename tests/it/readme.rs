@@ -8,12 +8,23 @@ use crate::support::program::{Serving, run};
 use crate::support::python::{python, succeeds};
 
 const API: &str = include_str!("../../docs/api.md");
+const CLIENT: &str = include_str!("../../src/client/mod.rs");
 
 /// The first block of this language.
 fn block(language: &str) -> &'static str {
     let fence = format!("```{language}\n");
     let (_, rest) = API.split_once(&fence).expect("the page has such a block");
     rest.split_once("```").expect("the block ends").0
+}
+
+#[test]
+fn the_rust_client_is_the_one_that_is_compiled() {
+    let (_, rest) = CLIENT.split_once("//! ```no_run\n").expect("an example in the documentation");
+    let (example, _) = rest.split_once("//! ```").expect("the example ends");
+    let example: Vec<&str> =
+        example.lines().map(|line| line.trim_start_matches("//!").trim_start_matches(' ')).collect();
+    let shown: Vec<&str> = block("rust").lines().map(str::trim_start).collect();
+    assert_eq!(shown, example);
 }
 
 fn generate_stubs(python: &str, into: &Path) {

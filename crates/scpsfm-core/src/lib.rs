@@ -14,14 +14,14 @@
 //! ```
 //!
 //! `training` makes the network's parameters, [`synthetic`] the scenes that training and evaluation need. Only `network`
-//! sees burn; `geometry` is plain f64 linear algebra.
+//! and `training` see burn; `geometry` is plain f64 linear algebra.
 
 #[macro_use]
 mod lists;
 
 pub mod domain;
 pub mod evaluation;
-pub mod geometry;
+pub(crate) mod geometry;
 pub(crate) mod network;
 pub mod parallel;
 mod simd;
@@ -29,4 +29,5 @@ pub mod solver;
 pub mod synthetic;
 pub mod training;
 
+pub use geometry::{fundamental::matrix_of_cameras, statistics};
 pub use network::subspace;

@@ -12,7 +12,7 @@ use serde::{Deserialize, Serialize};
 use crate::domain::{Grade, StopToken};
 use crate::evaluation::real::Side;
 use crate::evaluation::records;
-use crate::geometry::statistics::median;
+use crate::statistics::median;
 use crate::synthetic::PhotographedOptions;
 use crate::synthetic::metrics::agreement;
 use crate::synthetic::photographed::FocalKind;

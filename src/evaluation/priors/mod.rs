@@ -12,8 +12,8 @@ use scpsfm_core::evaluation::proposal::Study;
 
 use crate::domain::{Input, Limits, Proposal, Silent, SolveSettings, Status, StopToken};
 use crate::evaluation::records;
-use crate::geometry::statistics::median;
 use crate::solver;
+use crate::statistics::median;
 use crate::synthetic::metrics::{agreement, average_precision};
 use crate::synthetic::{Scene, SceneOptions};
 pub use scenes::Condition;

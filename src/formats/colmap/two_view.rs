@@ -12,7 +12,7 @@ use crate::domain::{Calibration, Solution};
 use crate::formats::LabelledInput;
 use crate::formats::cameras_json::groups_of_views;
 use crate::formats::metric::shown;
-use crate::geometry::matrix_of_cameras;
+use crate::matrix_of_cameras;
 
 /// Matches in all, 8 bytes each in memory and in the file. As many are read of a database at most.
 const MOST_MATCHES: usize = super::database::MAX_MATCHES;

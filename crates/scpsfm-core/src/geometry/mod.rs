@@ -24,7 +24,6 @@ pub(crate) mod robust_triangulation;
 pub mod statistics;
 pub(crate) mod triangulation;
 
-pub use fundamental::matrix_of_cameras;
 use nalgebra::{Matrix3x4, Vector4};
 
 /// Projective camera, 3x4, defined up to scale.

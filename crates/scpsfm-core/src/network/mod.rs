@@ -1,6 +1,6 @@
 //! The paper's network, optimised on each request's own measurement matrix: PointNet on burn, its three losses, Adam.
 //!
-//! May depend on `domain`, `geometry` and `simd` only (and, in tests, on `synthetic`); nothing else of ours sees burn.
+//! May depend on `domain`, `geometry` and `simd` only (and, in tests, on `synthetic`). Only this and `training` see burn.
 //! Everything in here runs on the calling thread: burn is built without its thread pool.
 //!
 //! [`head`] optimises it: by the paper's objective as printed (method PAPER), or by a continued one (method SCPSFM, and

@@ -32,13 +32,6 @@ named! {
     }
 }
 
-impl PhotographedMotion {
-    /// Whether the camera stays in one place but for [`PhotographedOptions::baseline`].
-    pub fn is_on_the_spot(self) -> bool {
-        matches!(self, Self::NearRotation | Self::PureRotation)
-    }
-}
-
 named! {
     /// What the lens does; [`PhotographedOptions`] holds the numbers.
     pub enum LensKind {
