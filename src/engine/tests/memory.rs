@@ -32,7 +32,7 @@ async fn a_job_that_takes_more_alone_is_refused() {
     let test = TestEngine::start(Options { max_solver_bytes: max, ..workers(1) }).await;
     let oversize = Oversize { quota: Quota::SolverBytes, asked: estimated(), max };
     let refused = test.engine.submit(new_job(Behavior::Succeed)).await;
-    assert_eq!(refused, Err(Error::JobTooLarge(oversize)));
+    assert_eq!(refused, Err(Error::JobTooLarge { index: 0, oversize }));
     let message = refused.expect_err("refused").to_string();
     assert!(message.contains(&estimated().to_string()), "{message}");
     assert!(message.contains(&format!("engine.max_solver_bytes is {max}")), "{message}");
