@@ -240,6 +240,7 @@ pub async fn run(args: Args) -> Result<Exit, Failure> {
         metrics = %metrics.address(),
         recovered_jobs = service.recovered_jobs(),
         queued_jobs = service.queued_jobs().await,
+        max_solver_bytes = config.engine.solver_bytes(),
         keys = service.key_count(),
         certificate_end = certificate.map(|certificate| prost_types::Timestamp::from(certificate.end).to_string()),
         "serving"

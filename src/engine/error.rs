@@ -33,9 +33,10 @@ pub enum Error {
     /// The batch alone is more than may ever wait.
     #[error("{0}")]
     BatchTooLarge(Oversize),
-    /// The job alone takes more memory than jobs may that run at once.
-    #[error("{0}")]
-    JobTooLarge(Oversize),
+    /// The job alone is estimated to take more memory than jobs that run at once may take together; `index` is its
+    /// place in the batch.
+    #[error("{oversize}")]
+    JobTooLarge { index: usize, oversize: Oversize },
     #[error(transparent)]
     InvalidArgument(#[from] InvalidInput),
     /// Only ended jobs can be deleted.

@@ -14,14 +14,14 @@ use tokio::time::{Instant, Interval, MissedTickBehavior, interval, interval_at, 
 use tracing::{Instrument, Span};
 
 use super::Inner;
+use super::limits::{RunPermit, SolverMemory};
 use super::observe::{self, Attempt, AttemptLost};
-use super::room::{Place, SolverMemory};
 use super::running::Running;
 use super::worker::{Assignment, AttemptHandle, Report, Started, Verdict, Worker};
 use crate::domain::job::{Failure, Job, JobName, JobState};
 use crate::domain::{Grade, Progress, StopReason, StopToken};
 use crate::solver;
-use crate::store::{self, Claimed, Ending, Lease, Outcome, Store};
+use crate::store::{self, Claimed, Claims, Ending, Lease, Outcome, Store};
 
 /// Least time between two stored progress events of a job: twice a second is as fast as people look, and a commit
 /// each is cheap for the disk.
@@ -38,16 +38,19 @@ pub(super) const HEARTBEATS_A_LEASE: u32 = 3;
 const LATE_HEARTBEAT: Duration = Duration::from_secs(1);
 
 /// Pause before a write is tried again that the store could not take.
-const RETRY_PAUSE: Duration = Duration::from_millis(500);
+pub(super) const RETRY_PAUSE: Duration = Duration::from_millis(500);
 
-/// How often an attempt that waits for memory looks whether it is to stop: as soon as a solver would.
-const STOP_LOOK: Duration = Duration::from_millis(100);
+/// How often an attempt that waits for memory looks whether it is to stop: as often as a solver does.
+const STOP_LOOK: Duration = Duration::from_millis(50);
 
 /// `Failure::reason` of a defect of ours.
 const INTERNAL: &str = "INTERNAL";
 
 /// Waits for the store no longer than the lease holds: a database that hangs must not keep the work going.
-async fn in_time<T>(until: Instant, writing: impl Future<Output = Result<T, store::Error>>) -> Result<T, store::Error> {
+pub(super) async fn in_time<T>(
+    until: Instant,
+    writing: impl Future<Output = Result<T, store::Error>>,
+) -> Result<T, store::Error> {
     let late = |_| Err(store::Error::Unavailable("no answer as long as the lease held".into()));
     timeout_at(until, writing).await.unwrap_or_else(late)
 }
@@ -84,7 +87,7 @@ pub(super) struct JobExecution {
     /// Held until it is solved; `None`: not taken yet.
     memory: Option<SolverMemory>,
     /// Held until its end is stored, or given up.
-    _place: Place,
+    _permit: RunPermit,
 }
 
 /// An attempt in a worker's hands.
@@ -109,7 +112,7 @@ fn stop_token(job: &Job, now: SystemTime) -> StopToken {
 
 impl JobExecution {
     /// Of a job that is leased: claimed, or prefetched for so long.
-    pub(super) fn new(inner: Arc<Inner>, claimed: Claimed, lease_for: Duration, place: Place) -> Self {
+    pub(super) fn new(inner: Arc<Inner>, claimed: Claimed, lease_for: Duration, permit: RunPermit) -> Self {
         let Claimed { job, lease, trace_parent, queue_time } = claimed;
         let stop = stop_token(&job, inner.now());
         let running = Running::list(inner.clone(), &lease, &stop, job.state == JobState::Running);
@@ -127,7 +130,7 @@ impl JobExecution {
             stored: None,
             running,
             memory: None,
-            _place: place,
+            _permit: permit,
         };
         if execution.is_begun() {
             let Lease { name, attempt } = &execution.lease;
@@ -191,10 +194,10 @@ impl JobExecution {
         let bytes = solver::estimated_bytes(view_count, track_count, observation_count);
         let inner = self.inner.clone();
         if !self.is_begun() {
-            self.memory = inner.room.memory_now(bytes);
+            self.memory = inner.limits.try_acquire_memory(bytes);
             return self.memory.as_ref().map(drop).ok_or(Verdict::Stopped(StopReason::Interrupted));
         }
-        let mut taking = pin!(inner.room.memory(bytes));
+        let mut taking = pin!(inner.limits.acquire_memory(bytes));
         let mut heartbeats = self.heartbeats();
         let mut looks = interval(STOP_LOOK);
         loop {
@@ -431,7 +434,7 @@ impl Loaded {
         let prefetched = (execution.lease.clone(), execution.job.create_time);
         let now = execution.inner.now();
         let claims = execution.inner.claim(Some(prefetched), false, now).instrument(begun.span.clone()).await;
-        let Some(claimed) = claims.begun else {
+        let Ok(Claims { begun: Some(claimed), prefetched: next, .. }) = claims else {
             execution.lapse();
             // Until then the worker is not free. Its outcome is dropped.
             let _ = handle.report.await;
@@ -439,7 +442,7 @@ impl Loaded {
         };
         execution.job = claimed.job;
         execution.has_begun(begun, now);
-        Some((Self { execution, handle }, claims.prefetched))
+        Some((Self { execution, handle }, next))
     }
 
     /// Until the worker is done.

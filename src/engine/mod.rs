@@ -6,10 +6,10 @@ mod admin;
 mod drain;
 mod error;
 mod execution;
+mod limits;
 mod notifications;
 mod notifier;
 mod observe;
-mod room;
 mod running;
 mod slot;
 mod submit;
@@ -40,7 +40,7 @@ pub use watch::Watch;
 pub use webhooks::{JobEncoder, Options as WebhookOptions, Secrets as WebhookSecrets};
 
 use crate::domain::job::{Job, JobName, JobState};
-use crate::domain::{Backend, Input, Observer, Solution, SolveSettings, StopToken};
+use crate::domain::{Backend, Input, Observer, Quota, Solution, SolveSettings, StopToken};
 use crate::parallel::Threads;
 use crate::solver;
 use crate::store::{self, Store};
@@ -125,7 +125,7 @@ impl Options {
     /// Three quarters of the memory of the machine or container, where the system tells: the rest is for calls, the
     /// store and the program.
     pub fn default_solver_bytes() -> u64 {
-        room::memory_bytes().map_or(u64::MAX, |bytes| bytes / 4 * 3)
+        limits::memory_bytes().map_or(u64::MAX, |bytes| bytes / 4 * 3)
     }
 }
 
@@ -166,6 +166,9 @@ fn worker_name() -> String {
     format!("{host}-{}", std::process::id())
 }
 
+/// Views, tracks and observations of a small job: a server that must refuse it is of little use.
+const SMALL_JOB: [u32; 3] = [10, 1_000, 10_000];
+
 /// A handle on a running engine; clones are the same engine.
 ///
 /// Jobs are stored before [`Engine::submit`] returns, and go on after a restart. End it with [`Engine::drain`]; one
@@ -201,7 +204,7 @@ struct Inner {
     notifier: Arc<notifier::Notifier>,
     /// Attempts that run in this process or are prefetched, for a cancel to reach them at once.
     running: Mutex<running::RunningAttempts>,
-    room: room::Room,
+    limits: limits::AttemptLimits,
     /// Counts the reasons to look for a job to claim; slots wait for a change.
     work: channel::Sender<u64>,
     /// Wakes the task that counts the queue.
@@ -244,7 +247,7 @@ impl Engine {
             store,
             notifier: Arc::default(),
             running: Mutex::default(),
-            room: room::Room::new(options.max_solver_bytes),
+            limits: limits::AttemptLimits::new(options.max_solver_bytes),
             work: channel::Sender::new(0),
             queue_changed: Notify::new(),
             webhook_due: Notify::new(),
@@ -258,6 +261,17 @@ impl Engine {
         });
         observe::engine_size(inner.options.queue.max_jobs, inner.options.workers, inner.options.max_solver_bytes);
         observe::store_state(StoreState::Healthy);
+        let max_solver_bytes = inner.options.max_solver_bytes;
+        let [views, tracks, observations] = SMALL_JOB;
+        let small_job_bytes = solver::estimated_bytes(views, tracks, observations);
+        if max_solver_bytes < small_job_bytes {
+            let key = Quota::SolverBytes.key();
+            tracing::warn!(
+                max_solver_bytes,
+                small_job_bytes,
+                "small jobs are refused too: {key} is less than they take"
+            );
+        }
         inner.taken_back(&recovered);
         inner.hire(threads)?;
         inner.queue_changed();

@@ -8,8 +8,8 @@ use tokio::sync::watch as channel;
 use tokio::task::JoinHandle;
 use tokio::time::{Instant, sleep, sleep_until, timeout};
 
-use super::execution::{Finished, HEARTBEATS_A_LEASE, JobExecution, Loaded};
-use super::room::suspect_after;
+use super::execution::{Finished, HEARTBEATS_A_LEASE, JobExecution, Loaded, RETRY_PAUSE, in_time};
+use super::limits::suspect_after;
 use super::worker::Worker;
 use super::{Inner, Options, Phase, StoreState, observe};
 use crate::store::{self, Claim, Claimed, Claims, Lease, Prefetch};
@@ -88,49 +88,62 @@ pub(super) async fn run(inner: Arc<Inner>, worker: Worker) {
     }
 }
 
-/// Claims the next job, and the one after it. Waits as long as a suspect runs in this process, or is about to. `None`:
-/// there is none to begin, or the engine drains.
+/// Claims the next job, and the one after it. Waits as long as a suspect runs in this process or waits for that, or a
+/// job waits for memory. `None`: there is none to begin, or the engine drains.
 async fn claim(inner: &Arc<Inner>, phase: &mut channel::Receiver<Phase>) -> Option<(JobExecution, Option<Claimed>)> {
-    let place = tokio::select! {
+    let permit = tokio::select! {
         biased;
         _ = phase.changed() => return None,
-        place = inner.room.place() => place?,
+        permit = inner.limits.acquire() => permit?,
     };
-    let claims = inner.claim(None, false, inner.now()).await;
-    match (claims.begun, claims.prefetched) {
-        (Some(claimed), next) => Some((JobExecution::new(inner.clone(), claimed, inner.options.lease, place), next)),
-        (None, Some(suspect)) => {
-            drop(place);
-            Some((begin_suspect(inner, suspect, phase).await?, None))
-        }
-        (None, None) => None,
+    let claims = inner.claim(None, false, inner.now()).await.ok()?;
+    if let Some(suspect) = claims.suspect {
+        drop(permit);
+        return Some((begin_suspect(inner, &suspect, phase).await?, None));
     }
+    Some((JobExecution::new(inner.clone(), claims.begun?, inner.options.lease, permit), claims.prefetched))
 }
 
 /// Begins a suspect once nothing else runs in this process. Until then it is queued and leased: an attempt that waits
-/// would be lost with those that run. `None`: it is another's by now, or nobody's, or the engine drains.
+/// would be lost with those that run. A store that fails is asked again as long as the lease holds. `None`: the suspect
+/// is left to others, because it is another's by now or nobody's, another suspect waits here, or the engine drains.
 async fn begin_suspect(
     inner: &Arc<Inner>,
-    suspect: Claimed,
+    suspect: &Claimed,
     phase: &mut channel::Receiver<Phase>,
 ) -> Option<JobExecution> {
-    tracing::warn!(job = %suspect.job.name, "it lost attempts before and runs alone: this server begins nothing else");
-    let begin = (suspect.lease, suspect.job.create_time);
+    let begin = (suspect.lease.clone(), suspect.job.create_time);
+    let Some(_waits) = inner.limits.try_acquire_suspect() else {
+        inner.give_back(begin).await;
+        return None;
+    };
+    tracing::warn!(job = %suspect.job.name, attempts = suspect.job.attempt, "job lost attempts; it runs alone");
     let lease = inner.options.lease;
-    let mut alone = pin!(inner.room.all_places());
-    loop {
+    let heartbeat = lease / HEARTBEATS_A_LEASE;
+    let (mut leased_until, mut pause) = (Instant::now() + lease, heartbeat);
+    let mut waiting = pin!(inner.limits.acquire_exclusive());
+    let mut permit = None;
+    while Instant::now() < leased_until {
         tokio::select! {
             biased;
-            _ = phase.changed() => return None,
-            place = &mut alone => {
-                let claimed = inner.claim(Some(begin), true, inner.now()).await.begun?;
-                return Some(JobExecution::new(inner.clone(), claimed, lease, place?));
+            _ = phase.changed() => {
+                inner.give_back(begin).await;
+                return None;
             }
-            () = sleep(lease / HEARTBEATS_A_LEASE) => {
-                inner.claim(Some(begin.clone()), false, inner.now()).await.prefetched?;
+            alone = &mut waiting, if permit.is_none() => permit = Some(alone?),
+            () = sleep(pause) => {}
+        }
+        let asked = Instant::now();
+        match in_time(leased_until, inner.claim(Some(begin.clone()), permit.is_some(), inner.now())).await {
+            Ok(Claims { begun: Some(claimed), .. }) => {
+                return Some(JobExecution::new(inner.clone(), claimed, lease, permit?));
             }
+            Ok(Claims { suspect: Some(_), .. }) => (leased_until, pause) = (asked + lease, heartbeat),
+            Ok(_) => return None,
+            Err(_) => pause = heartbeat.min(RETRY_PAUSE),
         }
     }
+    None
 }
 
 /// A job on its way into the worker's hands. Dropped, it is not begun, and its lease lapses.
@@ -138,7 +151,7 @@ type Prefetched = Task<Option<Loaded>>;
 
 /// Loads a prefetched job, unless a suspect waits for those that run.
 fn prefetch(inner: &Arc<Inner>, worker: &Worker, claimed: Claimed) -> Option<Prefetched> {
-    let execution = JobExecution::new(inner.clone(), claimed, inner.prefetch_lease(), inner.room.place_now()?);
+    let execution = JobExecution::new(inner.clone(), claimed, inner.prefetch_lease(), inner.limits.try_acquire()?);
     let worker = worker.clone();
     // One that cannot be read is told of when it is claimed.
     Some(Task(tokio::spawn(async move { execution.load(&worker).await.ok() })))
@@ -234,29 +247,44 @@ async fn due(inner: &Inner, counted: Instant) {
 }
 
 impl Inner {
-    /// Begins with the next job in the queue, or with one that was prefetched, and prefetches the one after it. Nothing
-    /// where there is none to begin, or the store does not answer. `alone`: nothing else runs in this process, nor is
-    /// anything to be prefetched; else a suspect is only leased.
-    pub(super) async fn claim(&self, begin: Option<(Lease, SystemTime)>, alone: bool, now: SystemTime) -> Claims {
-        let Options { worker_name, lease, shares, short_job, max_attempts, .. } = &self.options;
-        let terms = Prefetch { lease_for: self.prefetch_lease(), max_observations: MAX_PREFETCH_OBSERVATIONS };
-        let claim = Claim {
-            worker: worker_name.clone(),
-            lease_for: *lease,
-            begin,
-            prefetch: (!alone && !short_job.is_zero()).then_some(terms),
-            shares: shares.clone(),
-            solved: if shares.max_running.is_some() { self.solved() } else { Vec::new() },
-            suspect_after: (!alone).then(|| suspect_after(*max_attempts)),
-        };
-        let claims = self.store.claim(&claim, now).await.unwrap_or_else(|error| {
-            self.not_claimed(&error);
-            Claims::default()
-        });
+    /// Begins with the next job in the queue, or with one that was prefetched, and prefetches the one after it.
+    /// `alone`: nothing else runs in this process, nor is anything to be prefetched; else a suspect is only leased.
+    /// Errors are logged.
+    pub(super) async fn claim(
+        &self,
+        begin: Option<(Lease, SystemTime)>,
+        alone: bool,
+        now: SystemTime,
+    ) -> Result<Claims, store::Error> {
+        let claim = self.terms(begin, alone);
+        let claims = self.store.claim(&claim, now).await.inspect_err(|error| self.not_claimed(error))?;
         if claims.begun.is_some() {
             self.queue_changed();
         }
-        claims
+        Ok(claims)
+    }
+
+    /// Leaves a suspect to other processes before its lease runs out.
+    async fn give_back(&self, suspect: (Lease, SystemTime)) {
+        let claim = Claim { lease_for: Duration::ZERO, ..self.terms(Some(suspect), false) };
+        if let Err(error) = self.store.claim(&claim, self.now()).await {
+            self.not_claimed(&error);
+        }
+    }
+
+    /// What [`Inner::claim`] asks the store for.
+    fn terms(&self, begin: Option<(Lease, SystemTime)>, alone: bool) -> Claim {
+        let Options { worker_name, lease, shares, short_job, max_attempts, .. } = &self.options;
+        let prefetch = Prefetch { lease_for: self.prefetch_lease(), max_observations: MAX_PREFETCH_OBSERVATIONS };
+        Claim {
+            worker: worker_name.clone(),
+            lease_for: *lease,
+            begin,
+            prefetch: (!alone && !short_job.is_zero()).then_some(prefetch),
+            shares: shares.clone(),
+            solved: if shares.max_running.is_some() { self.solved() } else { Vec::new() },
+            suspect_after: (!alone).then(|| suspect_after(*max_attempts)),
+        }
     }
 
     /// How long a prefetched job is kept for its worker: until that has been at the job before it for too long to be

@@ -213,13 +213,22 @@ impl Inner {
             finished(tokio::task::spawn_blocking(encode)).await?
         };
         let max = self.options.max_solver_bytes;
-        let asked = |new: &NewRecord| solver::estimated_bytes(new.view_count, new.track_count, new.observation_count);
-        if let Some(asked) = records.iter().map(asked).find(|asked| *asked > max) {
-            observe::refused(observe::Refusal::JobTooLarge);
-            return Err(Error::JobTooLarge(Oversize { quota: Quota::SolverBytes, asked, max }));
+        for (index, new) in records.iter().enumerate() {
+            let asked = solver::estimated_bytes(new.view_count, new.track_count, new.observation_count);
+            // A repeated request gets its job, which may have been created under a larger bound.
+            if asked > max && !self.is_created(new).await? {
+                observe::refused(observe::Refusal::JobTooLarge);
+                return Err(Error::JobTooLarge { index, oversize: Oversize { quota: Quota::SolverBytes, asked, max } });
+            }
         }
         // On its own task: a caller that goes away must not leave a stored job untold.
         finished(tokio::spawn(async move { self.store_jobs(records, now).await })).await
+    }
+
+    /// Whether an earlier call with the same request id has created the job.
+    async fn is_created(&self, new: &NewRecord) -> Result<bool, Error> {
+        let Some(request) = &new.request else { return Ok(false) };
+        Ok(self.store.requested_job(&new.name.tenant, request).await?.is_some())
     }
 
     async fn store_jobs(&self, records: Vec<NewRecord>, now: SystemTime) -> Result<Vec<Job>, Error> {

@@ -137,8 +137,10 @@ impl proto::job_service_server::JobService for Jobs {
             let submission = Submission::open(&caller, request.into_inner(), &self.limits, &permit)?;
             let trace_parent = telemetry::tracing::traceparent_to_store(&span, caller.trace_parent());
             let new = submission.close(trace_parent).await?;
-            let stored = submission::store(&caller, "CreateJob", &self.engine, vec![new], permit).await?.pop();
-            let created = stored.ok_or_else(|| status::internal(&"one job was to be stored, none was"))?;
+            let stored =
+                submission::store(&caller, "CreateJob", &self.engine, vec![new], permit, status::from_engine).await?;
+            let created =
+                stored.into_iter().next().ok_or_else(|| status::internal(&"one job was to be stored, none was"))?;
             telemetry::tracing::record_job(&span, &created.name);
             Ok(Response::new(job::to_wire(&created)))
         };
@@ -158,7 +160,8 @@ impl proto::job_service_server::JobService for Jobs {
             let proto::BatchCreateJobsRequest { parent, requests } = request.into_inner();
             let trace_parent = telemetry::tracing::traceparent_to_store(&span, caller.trace_parent());
             let news = self.read_batch(&caller, &parent, requests, trace_parent, &permit).await?;
-            let created = submission::store(&caller, "BatchCreateJobs", &self.engine, news, permit).await?;
+            let refusal = status::from_engine_batch;
+            let created = submission::store(&caller, "BatchCreateJobs", &self.engine, news, permit, refusal).await?;
             Ok(Response::new(proto::BatchCreateJobsResponse { jobs: created.iter().map(job::to_wire).collect() }))
         };
         created.instrument(span.clone()).await

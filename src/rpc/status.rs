@@ -264,7 +264,7 @@ pub fn from_engine(error: engine::Error) -> Status {
         }
         engine::Error::UploadTooLarge(oversize) => too_large("UPLOAD_TOO_LARGE", "start.size_bytes", &oversize),
         engine::Error::BatchTooLarge(oversize) => too_large("BATCH_TOO_LARGE", "requests", &oversize),
-        engine::Error::JobTooLarge(oversize) => too_large("JOB_TOO_LARGE", "job", &oversize),
+        engine::Error::JobTooLarge { oversize, .. } => too_large("JOB_TOO_LARGE", "job", &oversize),
         engine::Error::AlreadyExists(taken) => {
             let reason = match taken {
                 TakenId::Job(_) => "JOB_ID_TAKEN",
@@ -317,6 +317,14 @@ pub fn from_engine(error: engine::Error) -> Status {
     }
 }
 
+/// The same of a batch: the refusal of one request names it.
+pub fn from_engine_batch(error: engine::Error) -> Status {
+    match error {
+        engine::Error::JobTooLarge { index, .. } => of_request(index, &from_engine(error)),
+        _ => from_engine(error),
+    }
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -360,7 +368,8 @@ mod tests {
         let of_batch = Quota::OF_QUEUE.map(|quota| (quota, engine::Error::BatchTooLarge(oversize(quota)), "requests"));
         let of_upload = [Quota::UploadBytes, Quota::TenantUploadBytes]
             .map(|quota| (quota, engine::Error::UploadTooLarge(oversize(quota)), "start.size_bytes"));
-        let of_job = (Quota::SolverBytes, engine::Error::JobTooLarge(oversize(Quota::SolverBytes)), "job");
+        let too_large = engine::Error::JobTooLarge { index: 0, oversize: oversize(Quota::SolverBytes) };
+        let of_job = (Quota::SolverBytes, too_large, "job");
         for (quota, error, field) in of_batch.into_iter().chain(of_upload).chain([of_job]) {
             let status = from_engine(error);
             assert_eq!(status.code(), Code::InvalidArgument);

@@ -11,7 +11,7 @@ use super::inflight::{Permit, WORKING_COPIES};
 use super::{proto, status};
 use crate::domain::job::Job;
 use crate::domain::{InputName, InvalidInput, Limits};
-use crate::engine::{Engine, JobInput, NewJob};
+use crate::engine::{self, Engine, JobInput, NewJob};
 use crate::telemetry::metrics::{Refusal, refused};
 use proto::create_job_request::Source as Inline;
 
@@ -139,6 +139,8 @@ impl Submission {
 /// Has jobs stored, and writes it into the audit log. In a task of its own, which holds what they take until they are,
 /// or are refused: a call that is dropped meanwhile ends neither.
 ///
+/// * `refusal`: what a refusal of the engine is to the caller
+///
 /// # Errors
 /// As [`Engine::submit_batch`].
 pub async fn store(
@@ -147,11 +149,12 @@ pub async fn store(
     engine: &Engine,
     news: Vec<NewJob>,
     permit: Permit,
+    refusal: fn(engine::Error) -> Status,
 ) -> Result<Vec<Job>, Status> {
     let (caller, engine) = (caller.clone(), engine.clone());
     let storing = async move {
         let _permit = permit;
-        let stored = engine.submit_batch(news).await.map_err(status::from_engine);
+        let stored = engine.submit_batch(news).await.map_err(refusal);
         caller.audit_jobs(method, stored.as_deref());
         stored
     };

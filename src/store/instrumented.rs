@@ -6,8 +6,8 @@ use std::time::{Duration, SystemTime};
 use super::{
     BegunUpload, CancelReply, Claim, Claims, Created, EncodedResult, Ending, Error, Heartbeat, InputPage, InputQuery,
     JobPage, JobPayload, JobQuery, Lease, NewInput, NewRecord, NewUpload, Notification, PassedOver, PurgedUploads,
-    QueueBounds, QueueReport, QueueStats, RetryReply, Store, StoreStats, StoredInput, Swept, UploadBounds, UploadLease,
-    UploadStatus, WebhookOutcome, WebhookQueue,
+    QueueBounds, QueueReport, QueueStats, Request, RetryReply, Store, StoreStats, StoredInput, Swept, UploadBounds,
+    UploadLease, UploadStatus, WebhookOutcome, WebhookQueue,
 };
 use crate::domain::InputName;
 use crate::domain::job::{Job, JobEvent, JobName};
@@ -37,6 +37,11 @@ impl<S: Store> Store for InstrumentedStore<S> {
     ) -> Result<Vec<Created>, Error> {
         let _timer = store_operation("create_jobs");
         self.0.create_jobs(new, bounds, now).await
+    }
+
+    async fn requested_job(&self, tenant: &str, request: &Request) -> Result<Option<Job>, Error> {
+        let _timer = store_operation("requested_job");
+        self.0.requested_job(tenant, request).await
     }
 
     async fn job(&self, name: &JobName) -> Result<Job, Error> {

@@ -150,6 +150,12 @@ pub trait Store: Send + Sync + 'static {
         now: SystemTime,
     ) -> Result<Vec<Created>, Error>;
 
+    /// The job that a tenant's request made before; `None` where it made none, or the job is gone.
+    ///
+    /// # Errors
+    /// [`Error::AlreadyExists`] for a request id with another body.
+    async fn requested_job(&self, tenant: &str, request: &Request) -> Result<Option<Job>, Error>;
+
     /// # Errors
     /// [`Error::NotFound`].
     async fn job(&self, name: &JobName) -> Result<Job, Error>;
@@ -174,7 +180,8 @@ pub trait Store: Send + Sync + 'static {
     /// be given back: a prefetched job that is not begun in time is any worker's, and no attempt was made.
     ///
     /// A suspect ([`Claim::suspect_after`]) is leased as long as a job that is begun, and not begun; a claim that is to
-    /// begin it extends that lease.
+    /// begin it extends that lease, or ends it with a `lease_for` of zero. Where nothing else runs in the process, the
+    /// claim begins it; the same claim once more, for want of an answer, gives the attempt that was begun.
     async fn claim(&self, claim: &Claim, now: SystemTime) -> Result<Claims, Error>;
 
     /// The encoded input of a job, and whether its cancel has been asked for.

@@ -311,9 +311,11 @@ pub struct Prefetch {
 pub struct Claims {
     /// It is running.
     pub begun: Option<Claimed>,
-    /// It is queued. Its lease is that of the attempt which a later claim is to begin. Where none is begun, it is a
-    /// suspect.
+    /// It is queued. Its lease is that of the attempt which a later claim is to begin.
     pub prefetched: Option<Claimed>,
+    /// It is queued and leased as a prefetched one, for a later claim by a process in which nothing else runs. None is
+    /// begun or prefetched beside it.
+    pub suspect: Option<Claimed>,
 }
 
 /// The right to write to a running job. `attempt` is the fencing token: a later lease has a larger one.

@@ -35,7 +35,7 @@ pub(crate) enum Bug {
     /// A reader of events passes one over now and then.
     MissedEvent,
     /// Jobs that lost attempts run among others.
-    Crowd,
+    SuspectsTogether,
 }
 
 /// What happens to the operations of one server from now on.
@@ -330,7 +330,7 @@ impl Connection for SimulatedConnection {
             Some(Bug::DoubleClaim) if statement.sql().contains("ORDER BY priority") => {
                 statement.replaced("state = 'QUEUED'", "state IN ('QUEUED', 'RUNNING')")
             }
-            Some(Bug::Crowd) if statement.sql().contains("state = 'QUEUED'") => {
+            Some(Bug::SuspectsTogether) if statement.sql().contains("state = 'QUEUED'") => {
                 statement.replaced("attempt, lost_attempts,", "attempt, 0 AS lost_attempts,")
             }
             _ => statement,

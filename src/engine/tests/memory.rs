@@ -32,11 +32,45 @@ async fn a_job_that_takes_more_alone_is_refused() {
     let test = TestEngine::start(Options { max_solver_bytes: max, ..workers(1) }).await;
     let oversize = Oversize { quota: Quota::SolverBytes, asked: estimated(), max };
     let refused = test.engine.submit(new_job(Behavior::Succeed)).await;
-    assert_eq!(refused, Err(Error::JobTooLarge(oversize)));
+    assert_eq!(refused, Err(Error::JobTooLarge { index: 0, oversize }));
     let message = refused.expect_err("refused").to_string();
     assert!(message.contains(&estimated().to_string()), "{message}");
     assert!(message.contains(&format!("engine.max_solver_bytes is {max}")), "{message}");
     assert_eq!(test.engine.queue_stats().await.expect("counts").queued, 0);
+}
+
+#[tokio::test]
+async fn a_repeated_request_gets_its_job_under_a_smaller_bound_too() {
+    let test = TestEngine::start(workers(1)).await;
+    let request = |id: &str| NewJob { request_id: Some(id.into()), ..new_job(Behavior::Succeed) };
+    let first = test.engine.submit(request("first")).await.expect("admitted").name;
+    test.ended(&first).await;
+    let options = Options { max_solver_bytes: estimated() - 1, ..workers(1) };
+    let solver = test.solver.solver_fn();
+    let restarted = Engine::start(options, test.store.clone(), solver, encode).await.expect("starts");
+    assert_eq!(restarted.submit(request("first")).await.expect("it is there").name, first);
+    let batch = restarted.submit_batch(vec![request("first"), request("second")]).await;
+    assert!(matches!(batch, Err(Error::JobTooLarge { index: 1, .. })), "{batch:?}");
+    assert_eq!(restarted.queue_stats().await.expect("counts").queued, 0);
+}
+
+#[tokio::test]
+async fn while_a_job_waits_for_memory_no_other_one_is_claimed() {
+    let test = TestEngine::start(Options { workers: 3, ..scarce() }).await;
+    let first = test.submit(Behavior::Wait).await;
+    test.solver.until_waiting(1).await;
+    let second = test.submit(Behavior::Wait).await;
+    // Nobody gets memory once the second waits for it.
+    eventually(|| async { test.engine.inner.limits.try_acquire_memory(1).is_none().then_some(()) }).await;
+    let third = test.submit(Behavior::Succeed).await;
+    // The third worker would claim it at once.
+    tokio::time::sleep(Duration::from_millis(100)).await;
+    let job = test.engine.job(&third).await.expect("exists");
+    assert_eq!((job.state, job.attempt), (JobState::Queued, 0));
+    test.engine.cancel(&second).await.expect("exists");
+    runs(&test, &third).await;
+    test.engine.cancel(&first).await.expect("exists");
+    assert_eq!(test.ended(&third).await.state, JobState::Succeeded);
 }
 
 #[tokio::test]

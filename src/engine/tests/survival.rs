@@ -6,6 +6,7 @@ use tokio::runtime::Runtime;
 
 use super::*;
 use crate::engine::{Drained, Error, StoreState, locked};
+use crate::store::Claim;
 
 #[tokio::test]
 async fn a_drain_lets_what_runs_finish_and_leaves_what_waits() {
@@ -232,8 +233,8 @@ async fn a_job_that_lost_attempts_waits_until_it_is_alone_and_others_wait_for_it
     test.store.execute("UPDATE jobs SET lost_attempts = 2 WHERE priority = 9").await;
     let other = test.submit(Behavior::Succeed).await;
     test.engine.resume().await.expect("resumes");
-    // Nobody gets a place once the suspect waits for all of them.
-    eventually(|| async { test.engine.inner.room.place_now().is_none().then_some(()) }).await;
+    // Nobody gets a permit once the suspect waits for all of them.
+    eventually(|| async { test.engine.inner.limits.try_acquire().is_none().then_some(()) }).await;
     for name in [&suspect, &other] {
         let job = test.engine.job(name).await.expect("exists");
         assert_eq!((job.state, job.attempt), (JobState::Queued, 0), "no attempt waits");
@@ -263,11 +264,14 @@ async fn a_suspect_that_waits_is_cancelled_and_left_by_a_drain_as_any_job_that_w
         let suspect = test.engine.submit(suspect).await.expect("admitted").name;
         test.store.execute("UPDATE jobs SET lost_attempts = 2 WHERE priority = 9").await;
         test.engine.resume().await.expect("resumes");
-        eventually(|| async { test.engine.inner.room.place_now().is_none().then_some(()) }).await;
+        eventually(|| async { test.engine.inner.limits.try_acquire().is_none().then_some(()) }).await;
         if drains {
             test.engine.drain(Duration::ZERO).await;
             let job = test.engine.job(&suspect).await.expect("exists");
             assert_eq!((job.state, job.attempt), (JobState::Queued, 0));
+            let claim = Claim::one("another", Duration::from_secs(3_600));
+            let begun = test.store.claim(&claim, SystemTime::now()).await.expect("claims").begun;
+            assert_eq!(begun.expect("a job").job.name, suspect, "it was given back");
         } else {
             test.engine.cancel(&suspect).await.expect("exists");
             let other = test.submit(Behavior::Succeed).await;
@@ -276,6 +280,44 @@ async fn a_suspect_that_waits_is_cancelled_and_left_by_a_drain_as_any_job_that_w
             assert_eq!(test.engine.job(&running).await.expect("exists").state, JobState::Running);
         }
     }
+}
+
+#[tokio::test]
+async fn of_several_suspects_a_server_keeps_one_and_leaves_the_others_to_other_servers() {
+    let test = TestEngine::start(Options { lease: Duration::from_secs(3_600), ..workers(3) }).await;
+    test.engine.pause().await.expect("pauses");
+    for _ in 0..3 {
+        test.submit(Behavior::Wait).await;
+    }
+    test.store.execute("UPDATE jobs SET lost_attempts = 2").await;
+    test.engine.resume().await.expect("resumes");
+    test.solver.until_waiting(1).await;
+    let claim = Claim { suspect_after: Some(2), ..Claim::one("another", Duration::from_secs(3_600)) };
+    for _ in 0..2 {
+        eventually(|| async { test.store.claim(&claim, SystemTime::now()).await.expect("claims").suspect }).await;
+    }
+    assert_eq!(test.engine.queue_stats().await.expect("counts").running, 1);
+}
+
+#[tokio::test]
+async fn a_suspect_is_kept_while_the_store_fails_and_begun_once() {
+    // Long enough that the store is back before the lease runs out.
+    let test = TestEngine::start(Options { lease: Duration::from_secs(600), ..workers(1) }).await;
+    test.engine.pause().await.expect("pauses");
+    let suspect = test.submit(Behavior::Succeed).await;
+    test.store.execute("UPDATE jobs SET lost_attempts = 2").await;
+    let broken = "CREATE TRIGGER broken BEFORE UPDATE OF state ON jobs WHEN new.state = 'RUNNING' \
+                  BEGIN SELECT RAISE(ABORT, 'broken'); END";
+    test.store.execute(broken).await;
+    test.engine.resume().await.expect("resumes");
+    // Its begin fails, again and again.
+    eventually(|| async { test.engine.inner.limits.try_acquire().is_none().then_some(()) }).await;
+    tokio::time::sleep(Duration::from_secs(1)).await;
+    let claim = Claim { suspect_after: Some(2), ..Claim::one("another", Duration::from_secs(3_600)) };
+    assert_eq!(test.store.claim(&claim, SystemTime::now()).await.expect("claims").suspect, None, "it is kept");
+    test.store.execute("DROP TRIGGER broken").await;
+    let job = test.ended(&suspect).await;
+    assert_eq!((job.state, job.attempt), (JobState::Succeeded, 1));
 }
 
 #[tokio::test]

@@ -64,6 +64,11 @@ pub(in crate::store) async fn a_request_id_stands_for_one_body_and_one_job(store
     assert!(!repeated.new);
     assert_eq!(repeated.job.name, first.name);
     assert_eq!(repeated.job.state, JobState::Running, "the job as it stands now");
+    let asked = |byte| request(byte).expect("one");
+    assert_eq!(store.requested_job("t", &asked(1)).await, Ok(Some(repeated.job)));
+    assert_eq!(store.requested_job("u", &asked(1)).await, Ok(None));
+    let error = store.requested_job("t", &asked(2)).await.expect_err("another body");
+    assert!(matches!(error, Error::AlreadyExists(_)), "{error}");
     let other_body = NewRecord { request: request(2), ..record("c") };
     let error = store.create_job(other_body, &ROOM, time(2)).await.expect_err("another body");
     assert!(matches!(error, Error::AlreadyExists(_)), "{error}");

@@ -39,7 +39,8 @@ const KEPT: Duration = Duration::from_secs(5);
 async fn prefetching(store: &dyn Store, begin: Option<&Claimed>, seconds: u64) -> Claims {
     let begin = begin.map(|prefetched| (prefetched.lease.clone(), prefetched.job.create_time));
     let prefetch = Some(Prefetch { lease_for: KEPT, max_observations: record("").observation_count });
-    let claim = Claim { begin, prefetch, ..Claim::one("worker", LEASE) };
+    // Of a worker among others, to which nothing is a suspect.
+    let claim = Claim { begin, prefetch, suspect_after: Some(u32::MAX), ..Claim::one("worker", LEASE) };
     store.claim(&claim, time(seconds)).await.expect("claims")
 }
 
@@ -144,25 +145,33 @@ pub(in crate::store) async fn a_suspect_is_begun_only_where_nothing_else_runs(st
 
     // It is leased, and stays so as long as it is asked for.
     let claims = store.claim(&busy, time(300)).await.expect("claims");
-    let suspect = claims.prefetched.expect("it is next");
-    assert_eq!((claims.begun, suspect.job.state), (None, JobState::Queued));
+    let suspect = claims.suspect.expect("it is next");
+    assert_eq!((claims.begun, claims.prefetched, suspect.job.state), (None, None, JobState::Queued));
     assert_eq!(suspect.lease, Lease { name: name.clone(), attempt: 3 });
     let other = Claim { worker: "other".into(), ..busy.clone() };
     let last = store.claim(&other, time(301)).await.expect("claims").begun.expect("a job");
     assert_eq!(last.lease.name, record("last").name, "others pass over it");
     let begin = Some((suspect.lease.clone(), suspect.job.create_time));
     let renewal = Claim { begin, ..busy };
-    let renewed = Claims { begun: None, prefetched: Some(suspect.clone()) };
+    let renewed = Claims { suspect: Some(suspect.clone()), ..Claims::default() };
     assert_eq!(store.claim(&renewal, time(320)).await, Ok(renewed.clone()));
     assert_eq!(store.claim(&other, time(349)).await, Ok(Claims::default()), "also one that finds no other job");
 
-    // Where its holder is gone, it is another's.
+    // Where its holder is gone, or gave it back, it is another's.
+    assert_eq!(store.claim(&other, time(350)).await, Ok(renewed.clone()));
+    let begin = Some((suspect.lease.clone(), suspect.job.create_time));
+    let give_back = Claim { begin, lease_for: Duration::ZERO, ..other.clone() };
+    assert_eq!(store.claim(&give_back, time(350)).await, Ok(renewed.clone()));
     assert_eq!(store.claim(&other, time(350)).await, Ok(renewed));
     assert_eq!(store.claim(&renewal, time(351)).await, Ok(Claims::default()));
     assert_eq!(story(store, &name).await, told_before, "nothing is told of all that");
     let alone = Claim { worker: "other".into(), suspect_after: None, ..renewal };
     let begun = store.claim(&alone, time(352)).await.expect("claims").begun.expect("it is its lease");
     assert_eq!((&begun.lease, begun.job.state), (&suspect.lease, JobState::Running));
+    let again = store.claim(&alone, time(352)).await.expect("claims").begun;
+    assert_eq!(again, Some(begun), "where the first answer was lost");
+    let late = Claim { worker: "worker".into(), ..alone };
+    assert_eq!(store.claim(&late, time(352)).await, Ok(Claims::default()), "another's attempt");
     let lost = store.sweep(time(352 + LEASE.as_secs()), MAX_ATTEMPTS).await.expect("sweeps").lost;
     let states: Vec<_> = lost.iter().map(|job| (&*job.name.job, job.state)).collect();
     let expected = [("suspect", JobState::Failed), ("first", JobState::Queued), ("last", JobState::Queued)];

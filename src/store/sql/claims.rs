@@ -4,7 +4,7 @@
 //! one that finds no other job, or anyone once the lease has expired.
 //!
 //! A suspect, which lost attempts before, is begun only by a process in which nothing else runs. Other claims lease it
-//! as a prefetched job, so that it stays with one process until that is at rest, and extend this lease.
+//! as a prefetched job, so that it stays with one process until that is idle, and extend this lease.
 
 use std::time::SystemTime;
 
@@ -42,17 +42,19 @@ pub(super) async fn claim<C: Connection>(
             None => prefetched_by_any(connection, claim, now, lease_now).await?,
         },
     };
-    let Some(job) = job else { return Ok(Claims::default()) };
+    let Some(job) = job else {
+        return Ok(Claims { begun: begun_before(connection, claim, lease_now).await?, ..Claims::default() });
+    };
     if is_suspect(claim, &job) {
         let suspect = lease(connection, claim, &job, lease_now + claim.lease_for).await?;
-        return Ok(Claims { begun: None, prefetched: Some(suspect) });
+        return Ok(Claims { suspect: Some(suspect), ..Claims::default() });
     }
     let begun = begin(connection, claim, &job, now, lease_now).await?;
     let prefetched = match claim.prefetch {
         Some(terms) => prefetch(connection, claim, terms, now, lease_now).await?,
         None => None,
     };
-    Ok(Claims { begun: Some(begun), prefetched })
+    Ok(Claims { begun: Some(begun), prefetched, suspect: None })
 }
 
 /// Whether a job is to be begun once nothing else runs in the process.
@@ -117,8 +119,29 @@ async fn prefetched<C: Connection>(
     connection.optional_row(same).await?.as_ref().map(LockedJob::from_row).transpose()
 }
 
+/// The job that an earlier claim of this process has begun, where the answer was lost: its lease is extended. Of a
+/// process in which nothing else runs; in another one a worker has it.
+async fn begun_before<C: Connection>(
+    connection: &mut C,
+    claim: &Claim,
+    lease_now: SystemTime,
+) -> Result<Option<Claimed>, Error> {
+    let (Some((lease, created)), None) = (&claim.begin, claim.suspect_after) else { return Ok(None) };
+    let extend = Statement::new(returning_job!(
+        "UPDATE jobs SET lease_expires = $1 WHERE tenant = $2 AND job = $3 AND attempt = $4 AND create_time = $5 \
+         AND state = 'RUNNING' AND lease_worker = $6"
+    ))
+    .bind(micros(lease_now + claim.lease_for))
+    .bind(&lease.name.tenant)
+    .bind(&lease.name.job)
+    .bind(lease.attempt)
+    .bind(micros(*created))
+    .bind(&claim.worker);
+    connection.optional_row(extend).await?.map(|row| claimed(&row, 0)).transpose()
+}
+
 /// A job that any worker has prefetched: it would wait for that worker, and this one is idle. There are as many as
-/// workers at most, and their tenants' turns have come. A suspect stays with the process that waits to be at rest.
+/// workers at most, and their tenants' turns have come. A suspect stays with the process that waits to be idle.
 async fn prefetched_by_any<C: Connection>(
     connection: &mut C,
     claim: &Claim,

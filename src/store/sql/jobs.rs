@@ -201,7 +201,11 @@ async fn admit<C: Connection>(
 }
 
 /// The job that this request id made before.
-async fn earlier<C: Connection>(connection: &mut C, tenant: &str, request: &Request) -> Result<Option<Job>, Error> {
+pub(super) async fn earlier<C: Connection>(
+    connection: &mut C,
+    tenant: &str,
+    request: &Request,
+) -> Result<Option<Job>, Error> {
     let select = Statement::new("SELECT digest, job_id FROM request_ids WHERE tenant = $1 AND request_id = $2")
         .bind(tenant)
         .bind(&request.id);

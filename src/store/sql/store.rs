@@ -12,7 +12,7 @@ use crate::domain::job::{Job, JobEvent, JobName};
 use crate::domain::progress::Progress;
 use crate::store::record::{
     CancelReply, Claim, Claims, Created, EncodedResult, Ending, Heartbeat, JobInput, JobPayload, Lease, NewRecord,
-    Outcome, PassedOver, QueueBounds, QueueReport, QueueStats, RetryReply, StoreStats, Swept, WebhookOutcome,
+    Outcome, PassedOver, QueueBounds, QueueReport, QueueStats, Request, RetryReply, StoreStats, Swept, WebhookOutcome,
     WebhookQueue,
 };
 use crate::store::upload::{
@@ -79,6 +79,10 @@ impl<D: Database> Store for D {
         writes!(self, Size::Payload, WriteIntent::Begins(stored.sum()), [new, bounds], |connection| jobs::create(
             connection, &new, &bounds, now
         ))
+    }
+
+    async fn requested_job(&self, tenant: &str, request: &Request) -> Result<Option<Job>, Error> {
+        reads!(self, Size::Small, |connection| jobs::earlier(connection, tenant, request))
     }
 
     async fn job(&self, name: &JobName) -> Result<Job, Error> {

@@ -200,6 +200,28 @@ async fn a_batch_that_never_fits_is_not_told_to_come_back() {
     }
 }
 
+#[tokio::test]
+async fn a_job_of_a_batch_that_takes_too_much_memory_is_named() {
+    // What the first request takes, and not the second, which has more tracks.
+    let engine = engine::Options { max_solver_bytes: scpsfm::solver::estimated_bytes(3, 4, 12), ..one_worker() };
+    let server = TestServer::start_with(quick(), Options::default(), engine).await;
+    let mut jobs = server.jobs().await;
+    let larger = || create(create_job_request::Source::TrackSet(convert::input::to_wire(&raw(3, 50))));
+    let field = |status: &tonic::Status| {
+        assert_eq!(status.code(), Code::InvalidArgument, "{status}");
+        assert_eq!(status.get_details_error_info().expect("an ErrorInfo").reason, "JOB_TOO_LARGE");
+        status.get_details_bad_request().expect("a BadRequest").field_violations[0].field.clone()
+    };
+    let batch =
+        proto::BatchCreateJobsRequest { parent: "tenants/default".into(), requests: vec![create_tracks(), larger()] };
+    let status = jobs.batch_create_jobs(batch).await.expect_err("never fits");
+    assert_eq!(field(&status), "requests[1].job");
+    assert!(status.message().starts_with("requests[1]: job: "), "{status}");
+    assert_eq!(field(&jobs.create_job(larger()).await.expect_err("never fits")), "job");
+    let list = proto::ListJobsRequest { parent: "tenants/default".into(), ..Default::default() };
+    assert!(jobs.list_jobs(list).await.expect("a page").into_inner().jobs.is_empty(), "nothing was stored");
+}
+
 /// Fills a queue of these bounds until it refuses, by `bound`.
 async fn fills_up(queue: QueueBounds, bound: &str) {
     let (solver, hold) = held();

@@ -263,7 +263,7 @@ fn a_seed_shows_its_log() {
 
 #[test]
 fn a_defect_that_was_built_in_is_found() {
-    for bug in [Bug::DoubleClaim, Bug::LateWrite, Bug::MissedEvent, Bug::Crowd] {
+    for bug in [Bug::DoubleClaim, Bug::LateWrite, Bug::MissedEvent, Bug::SuspectsTogether] {
         assert!(!failures(0..1_000, Some(bug)).is_empty(), "{bug:?}");
     }
 }
