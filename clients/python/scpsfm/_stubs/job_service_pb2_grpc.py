@@ -125,10 +125,10 @@ class JobServiceServicer(object):
     def CreateJob(self, request, context):
         """Stores a job; a worker takes it up when one is free.
 
-        INVALID_ARGUMENT before anything is stored, with the reason JOB_TOO_LARGE where the server has not the memory to
-        solve the job; ALREADY_EXISTS (reasons JOB_ID_TAKEN and REQUEST_ID_REUSED) when the
-        job id is taken, or the request id was used with another body; RESOURCE_EXHAUSTED, at once, when the queue is full
-        (reason QUEUE_FULL), the server's memory for calls (MEMORY) or its disk (STORE_FULL).
+        INVALID_ARGUMENT before anything is stored, with the reason JOB_TOO_LARGE when the job is estimated to need more
+        memory than the server has for jobs; ALREADY_EXISTS (reasons JOB_ID_TAKEN and REQUEST_ID_REUSED) when the job id is
+        taken, or the request id was used with another body; RESOURCE_EXHAUSTED, at once, when the queue is full (reason
+        QUEUE_FULL), the server's memory for calls (MEMORY) or its disk (STORE_FULL).
         """
         context.set_code(grpc.StatusCode.UNIMPLEMENTED)
         context.set_details('Method not implemented!')
