@@ -13,11 +13,11 @@ use std::time::{Duration, SystemTime};
 use tokio::time::{Instant, Interval, MissedTickBehavior, interval, interval_at, sleep, sleep_until, timeout_at};
 use tracing::{Instrument, Span};
 
-use super::Inner;
 use super::limits::{RunPermit, SolverMemory};
 use super::observe::{self, Attempt, AttemptLost};
 use super::running::Running;
 use super::worker::{Assignment, AttemptHandle, Report, Started, Verdict, Worker};
+use super::{Inner, Phase};
 use crate::domain::job::{Failure, Job, JobName, JobState};
 use crate::domain::{Grade, Progress, StopReason, StopToken};
 use crate::solver;
@@ -193,10 +193,14 @@ impl JobExecution {
         let Job { view_count, track_count, observation_count, .. } = self.job;
         let bytes = solver::estimated_bytes(view_count, track_count, observation_count);
         let inner = self.inner.clone();
-        if !self.is_begun() {
-            self.memory = inner.limits.try_acquire_memory(bytes);
-            return self.memory.as_ref().map(drop).ok_or(Verdict::Stopped(StopReason::Interrupted));
+        self.memory = inner.limits.try_acquire_memory(bytes);
+        if self.memory.is_some() {
+            return Ok(());
         }
+        if !self.is_begun() {
+            return Err(Verdict::Stopped(StopReason::Interrupted));
+        }
+        tracing::info!(bytes, "waits for memory that other jobs have");
         let mut taking = pin!(inner.limits.acquire_memory(bytes));
         let mut heartbeats = self.heartbeats();
         let mut looks = interval(STOP_LOOK);
@@ -212,7 +216,9 @@ impl JobExecution {
                 }
                 () = sleep_until(self.leased_until), if !self.lost => self.lapse(),
                 _ = looks.tick() => {
-                    if let Some(reason) = self.stop.reason() {
+                    // A drain lets those finish that are being solved.
+                    let drain = (inner.phase() != Phase::Open).then_some(StopReason::Interrupted);
+                    if let Some(reason) = self.stop.reason().or(drain) {
                         return Err(Verdict::Stopped(reason));
                     }
                 }

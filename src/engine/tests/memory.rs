@@ -108,6 +108,22 @@ async fn a_job_that_waits_for_memory_is_given_back_by_a_drain() {
 }
 
 #[tokio::test]
+async fn a_drain_gives_a_job_that_waits_for_memory_back_at_once() {
+    let test = TestEngine::start(scarce()).await;
+    let first = test.submit(Behavior::Wait).await;
+    test.solver.until_waiting(1).await;
+    let second = test.submit(Behavior::Wait).await;
+    runs(&test, &second).await;
+    let release = async {
+        let is_queued = async || test.engine.job(&second).await.expect("exists").state == JobState::Queued;
+        eventually(|| async { is_queued().await.then_some(()) }).await;
+        test.engine.cancel(&first).await.expect("exists");
+    };
+    let (drained, ()) = tokio::join!(test.engine.drain(Duration::from_secs(600)), release);
+    assert_eq!(drained, Drained { finished: 1, given_back: 1 });
+}
+
+#[tokio::test]
 async fn short_jobs_that_would_be_prefetched_are_all_solved_one_after_the_other() {
     let test = TestEngine::start(Options { short_job: Duration::from_secs(3_600), ..scarce() }).await;
     let jobs = (0..12).map(|_| new_job(Behavior::Succeed)).collect();
