@@ -26,6 +26,11 @@ const DEPTH_ROUNDS: usize = 10;
 /// Iterations of each adjustment: they start near the minimum, or the model is wrong and its cost only has to show it.
 const ITERATIONS: usize = 30;
 
+/// Share of what homographies miss of a point from which one observation makes up nearly all of it.
+const ALONE_SHARE: f64 = 0.9;
+/// Share of a view's observations up to which those are a minority: homographies explain views by three quarters.
+const MOST_ALONE: f64 = 0.25;
+
 /// A model at its minimum.
 #[derive(Debug, Clone)]
 pub struct CriticalFit<M> {
@@ -58,31 +63,50 @@ impl ReferenceHomographies {
         Some(Self { views: homographies, positions })
     }
 
-    /// The points of which each alone makes up most of what the homographies miss in most of its views: no view has more
-    /// than one.
+    /// The observations that tell of depth and that no other bears out, one entry an observation. What noise explains
+    /// is never among them.
     ///
-    /// Behind homographies the fourth column of a camera is free, and takes up any one track of its view, wrong or
-    /// right. What noise explains is never dominant.
+    /// Behind homographies the fourth columns of the cameras are free. That of a view takes up any one track, wrong or
+    /// right: of points of which each alone makes up most of what the homographies miss in most of its views, all
+    /// observations are among them. Scaled up, it takes up whatever slid along its epipolar lines in that view alone,
+    /// for the points need next to no depth then: of other points an observation is among them that makes up nearly all
+    /// that is missed of its point, in views where these are a minority.
     ///
     /// * `noise`: one standard deviation of a coordinate, normalised units
-    pub fn dominant_points(&self, observations: &[Observation], noise: f64) -> Vec<bool> {
-        let usable = || observations.iter().filter(|seen| seen.is_usable(self.views.len(), self.positions.len()));
+    pub fn unsupported(&self, observations: &[Observation], noise: f64) -> Vec<bool> {
+        let is_usable = |seen: &Observation| seen.is_usable(self.views.len(), self.positions.len());
         let missed = |seen: &Observation| {
             let moved = self.views[seen.view] * self.positions[seen.point].unwrap_or_default().push(1.0);
             Some((moved.xy() / moved.z - seen.xy).norm_squared()).filter(|missed| missed.is_finite())
         };
+        let missed: Vec<Option<f64>> =
+            observations.iter().map(|seen| missed(seen).filter(|_| is_usable(seen))).collect();
+        let found = || observations.iter().zip(&missed).filter_map(|(seen, missed)| Some((seen, (*missed)?)));
         // Of two observations, the one in the reference view and this one.
         let by_noise = 2.0 * CHI_SQUARE_OF_TWO * noise * noise;
-        let mut of_view = vec![0.0; self.views.len()];
-        usable().for_each(|seen| of_view[seen.view] += missed(seen).unwrap_or(0.0));
-        let mut counts = vec![(0, 0); self.positions.len()];
-        for seen in usable() {
-            let (dominant, observed) = &mut counts[seen.point];
-            let is_dominant = |missed: f64| missed > by_noise && missed > of_view[seen.view] / 2.0;
-            *dominant += usize::from(missed(seen).is_some_and(is_dominant));
-            *observed += 1;
+        let (mut of_view, mut of_point) = (vec![(0.0, 0); self.views.len()], vec![(0.0, 0); self.positions.len()]);
+        for (seen, missed) in found() {
+            for (sum, count) in [&mut of_view[seen.view], &mut of_point[seen.point]] {
+                *sum += missed;
+                *count += 1;
+            }
         }
-        counts.into_iter().map(|(dominant, observed)| 2 * dominant > observed).collect()
+        let (mut dominant, mut alone) = (vec![0; self.positions.len()], vec![0; self.views.len()]);
+        let is_alone = |seen: &Observation, missed: f64| {
+            let (of_point, observed) = of_point[seen.point];
+            observed > 2 && missed > by_noise && missed > ALONE_SHARE * of_point
+        };
+        for (seen, missed) in found() {
+            dominant[seen.point] += usize::from(missed > by_noise && missed > of_view[seen.view].0 / 2.0);
+            alone[seen.view] += usize::from(is_alone(seen, missed));
+        }
+        let is_unsupported = |(seen, missed): (&Observation, &Option<f64>)| {
+            missed.is_some_and(|missed| {
+                let is_minority = alone[seen.view] as f64 <= MOST_ALONE * of_view[seen.view].1 as f64;
+                2 * dominant[seen.point] > of_point[seen.point].1 || is_minority && is_alone(seen, missed)
+            })
+        };
+        observations.iter().zip(&missed).map(is_unsupported).collect()
     }
 
     fn observed(&self) -> usize {
@@ -349,6 +373,28 @@ mod tests {
             reduced(turning.cost, turning.unknowns),
             reduced(moving.cost, moving.unknowns),
         ]
+    }
+
+    /// Of a plane, some tracks slide along the epipolar lines of one view: projective cameras fit them all.
+    #[test]
+    fn what_one_view_alone_says_of_depth_is_unsupported() {
+        for seed in 0..10 {
+            let mut scene = testing::scene_of(seed, 6, 60, NOISE, Motion::General, true);
+            let (views, points) = (scene.poses.len(), scene.points.len());
+            let start = |scene: &TestScene| {
+                ReferenceHomographies::new(&scene.observations, views, points, NOISE).expect("complete tracks")
+            };
+            let found = start(&scene).unsupported(&scene.observations, NOISE);
+            let by_chance = found.iter().filter(|found| **found).count();
+            assert!(by_chance <= 2, "seed {seed}: {by_chance} of a plane");
+            let is_slid = |seen: &Observation| seen.view == 4 && seen.point < 9;
+            for seen in scene.observations.iter_mut().filter(|seen| is_slid(seen)) {
+                seen.xy += Vector2::new(0.06, 0.02) * (1.0 + 0.2 * seen.point as f64);
+            }
+            let found = start(&scene).unsupported(&scene.observations, NOISE);
+            let told = scene.observations.iter().zip(&found).filter(|(seen, found)| is_slid(seen) == **found).count();
+            assert!(told + 2 >= found.len(), "seed {seed}: {told} of {} told", found.len());
+        }
     }
 
     #[test]

@@ -39,16 +39,16 @@ pub(super) enum Upgrade {
     None,
 }
 
-/// The observations without those of points that alone tell of depth where homographies nearly explain the views; `None`
-/// where there are none.
-pub(super) fn without_dominant_points(problem: &Uncalibrated) -> Option<Vec<Observation>> {
+/// The observations without those that tell of depth where homographies nearly explain the views, and that no other
+/// bears out; `None` where there are none.
+pub(super) fn without_unsupported(problem: &Uncalibrated) -> Option<Vec<Observation>> {
     let Uncalibrated { observations, noise, .. } = *problem;
     let (views, points) = (problem.cameras.len(), problem.points.len());
     homography::median_residual(observations, views, noise, problem.options.critical.lens_limit)?;
     let start = ReferenceHomographies::new(observations, views, points, noise)?;
-    let is_dominant = start.dominant_points(observations, noise);
-    let is_kept = |seen: &&Observation| !is_dominant.get(seen.point).copied().unwrap_or(false);
-    is_dominant.contains(&true).then(|| observations.iter().filter(is_kept).copied().collect())
+    let is_unsupported = start.unsupported(observations, noise);
+    let kept = observations.iter().zip(&is_unsupported).filter(|(_, is_unsupported)| !**is_unsupported);
+    is_unsupported.contains(&true).then(|| kept.map(|(seen, _)| *seen).collect())
 }
 
 /// What kind of motion and scene the views of this consensus show.

@@ -170,9 +170,8 @@ impl Outcome {
 /// [`Error::Stopped`] when `stop` fired; what stands by then is not worth returning.
 pub fn calibrate(problem: &Uncalibrated, scale_px: f64, stop: &StopToken) -> Result<Vec<Outcome>, Error> {
     let problem = problem.with_least_noise();
-    let without_dominant = critical::without_dominant_points(&problem);
-    let problem =
-        &Uncalibrated { observations: without_dominant.as_deref().unwrap_or(problem.observations), ..problem };
+    let supported = critical::without_unsupported(&problem);
+    let problem = &Uncalibrated { observations: supported.as_deref().unwrap_or(problem.observations), ..problem };
     let Compared { cameras, points, mut fit, critical, mut warnings } =
         Compared::new(problem, problem, scale_px, stop, &mut || ())?;
     warnings.extend(critical.warnings);
