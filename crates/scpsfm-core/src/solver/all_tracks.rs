@@ -5,9 +5,9 @@
 
 use super::block::Block;
 use super::grow::{self, Consensus, ConsensusOptions};
-use super::near_duplicates;
 use super::problem::Problem;
 use super::view_selection::evenly;
+use super::{near_duplicates, static_tracks};
 use crate::geometry::Point;
 use crate::geometry::bundle::{self, projective};
 
@@ -37,7 +37,10 @@ const OPTIONS: AllTracksOptions = AllTracksOptions::DEFAULT;
 /// The block and its consensus with the tracks that the search left aside; `None` where there are none, or where what
 /// was found does not carry over.
 pub fn extend(problem: &Problem, searched: &Block, consensus: &Consensus) -> Option<(Block, Consensus)> {
-    let block = near_duplicates::without(problem, problem.block(&searched.views));
+    let mut block = near_duplicates::without(problem, problem.block(&searched.views));
+    if !problem.is_of_static(&searched.tracks) {
+        block = static_tracks::without(problem, &block).unwrap_or(block);
+    }
     let all = block.sample_with(OPTIONS.most_tracks, problem.settings.seed, &searched.tracks);
     if all.tracks.len() == searched.tracks.len() {
         return None;

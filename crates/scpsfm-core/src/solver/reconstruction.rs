@@ -68,6 +68,7 @@ impl Reconstruction {
             component_of_view: vec![0; problem.views()],
             component_of_track: vec![0; problem.tracks()],
             by_observation: attempt.judges_observations(),
+            of_static: problem.is_of_static(&projective.tracks),
             // Estimated under projective cameras: metric ones fit worse by so much.
             noise: projective.noise * metric.map_or(1.0, |_| outcome.rms_ratio.max(1.0)),
             inlier_share: share(projective.tracks.len(), projective.tried),
@@ -102,6 +103,7 @@ impl Reconstruction {
             component_of_view: model.component_of.clone(),
             component_of_track: (0..problem.tracks()).map(component).collect(),
             by_observation: seed.judges_observations(),
+            of_static: model.of_static,
             noise: model.noise,
             inlier_share: share(
                 verified(model).len(),

@@ -1,8 +1,9 @@
 //! Tracks that stay where they are in the image while others move: dirt, a watermark, the camera's own carrier.
 //!
 //! They agree on a camera that stands still, before any scene. Where they are many, a search finds nothing else, and they
-//! hold every view that joins. Both therefore look at the others alone. What comes of these judges all tracks in the end,
-//! so that the far points of a drive and the middle of an orbit, which stay in place too, are not lost.
+//! hold every view that joins. Both therefore look at the others alone, and what comes of these holds no static track: a
+//! camera that moves without turning would take them all for points infinitely far away. The far points of a drive and
+//! the middle of an orbit, which stay in place too, are too few to count as static.
 
 use nalgebra::Vector2;
 

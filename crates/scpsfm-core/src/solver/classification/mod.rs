@@ -44,6 +44,8 @@ pub struct Geometry {
     pub noise: f64,
     /// Prior probability that a track is right.
     pub inlier_share: f64,
+    /// Whether it is of static tracks, which are no part of a reconstruction of others.
+    pub of_static: bool,
 }
 
 impl Geometry {
@@ -97,8 +99,8 @@ pub struct SplitPoint {
     pub retained: Vec<Observation>,
 }
 
-/// Judges every track that has three observations in registered views or more; the others have weight 0 and no
-/// residuals.
+/// Judges every track that has three observations in registered views or more; the others, and static ones that the
+/// geometry is not of, have weight 0 and no residuals.
 ///
 /// Twice: with a wide tail first, then with the tail that the tracks show which are right in all their observations.
 /// Where there is none, a wrong observation is told from a right one nearer by: at 8 to 9 core deviations instead of 12

@@ -54,6 +54,7 @@ impl TrackClassifier<'_> {
         let Self { problem, geometry, .. } = self;
         let observation = |&k: &usize| geometry.observation(problem, k);
         let (tracks, seen): (Vec<usize>, Vec<Vec<usize>>) = tracks
+            .filter(|&track| geometry.of_static || !problem.is_static[track])
             .map(|track| (track, geometry.of_track(problem, track)))
             .filter(|(_, seen)| seen.len() >= VERIFIED)
             .unzip();
@@ -287,6 +288,7 @@ mod tests {
             component_of_view: Vec::new(),
             component_of_track: Vec::new(),
             by_observation,
+            of_static: false,
             noise: 0.001,
             inlier_share: 0.3,
         }

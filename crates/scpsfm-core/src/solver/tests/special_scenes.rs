@@ -160,6 +160,27 @@ fn what_is_static_in_the_image_is_not_the_scene() {
     }
 }
 
+/// A camera that does not turn sees what is infinitely far away where it stays: not nearly half of what it sees.
+#[test]
+fn what_is_static_before_a_camera_that_does_not_turn_is_not_the_scene_either() {
+    for seed in 0..3 {
+        let options = SceneOptions { motion: Motion::PureTranslation, noise: 0.001, outliers: 0.4, seed, ..default() };
+        let (input, scene) = scene(options);
+        let mut raw = input.to_raw();
+        for k in 0..raw.x.len() {
+            let track = raw.track[k];
+            if !scene.truth.inlier[track as usize] {
+                (raw.x[k], raw.y[k]) = (f64::from(track * 131 % 997), f64::from(track * 311 % 991));
+            }
+        }
+        let input = Input::new(raw, &Limits::default(), "scene").expect("valid input");
+        let solution = solved(&input, &SolveSettings { seed, ..SolveSettings::default() });
+        let found = agreement(&solution.tracks.inlier, &scene.truth.inlier);
+        assert!(found.precision > 0.99 && found.recall > 0.95, "seed {seed}: {found:?}");
+        assert!(warns(&solution, WarningCode::StaticTracks), "seed {seed}");
+    }
+}
+
 fn default() -> SceneOptions {
     SceneOptions::default()
 }
