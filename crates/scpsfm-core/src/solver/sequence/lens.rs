@@ -66,8 +66,9 @@ pub fn undo(problem: &mut Problem, ended: &Ended, recorder: &mut Recorder) -> Re
         let subsets = view_selection::subsets(&sets);
         let sets: Vec<Vec<usize>> = subsets.into_iter().chain(sets).take(OPTIONS.sets).collect();
         let of_pinhole = evidence(problem, &sets, recorder)?;
+        let total_of_pinhole = total(&of_pinhole);
         let without = problem.undone.take();
-        let mut best = Best { focal: None, evidence: of_pinhole, undone: None };
+        let mut best = Best { focal: None, evidence: of_pinhole.clone(), undone: None };
         for focal in OPTIONS.focals {
             best.offer(focal, without.as_ref(), camera, problem, &sets, recorder)?;
         }
@@ -77,8 +78,11 @@ pub fn undo(problem: &mut Problem, ended: &Ended, recorder: &mut Recorder) -> Re
                 best.offer(focal, without.as_ref(), camera, problem, &sets, recorder)?;
             }
         }
-        let least = of_pinhole + OPTIONS.least_gain.max(OPTIONS.least_share * of_pinhole);
-        problem.undone = best.undone.filter(|_| best.evidence > least).or(without);
+        let least = total_of_pinhole + OPTIONS.least_gain.max(OPTIONS.least_share * total_of_pinhole);
+        // A seed of few tracks may find others by chance, but hardly every one.
+        let gains_everywhere = best.evidence.iter().zip(&of_pinhole).all(|(own, of_pinhole)| own >= of_pinhole);
+        let is_taken = gains_everywhere && total(&best.evidence) > least;
+        problem.undone = best.undone.filter(|_| is_taken).or(without);
     }
     Ok(problem.undone.is_some())
 }
@@ -87,7 +91,8 @@ pub fn undo(problem: &mut Problem, ended: &Ended, recorder: &mut Recorder) -> Re
 struct Best {
     /// `None`: a pinhole does.
     focal: Option<f64>,
-    evidence: f64,
+    /// Of each seed.
+    evidence: Vec<f64>,
     undone: Option<Undone>,
 }
 
@@ -110,25 +115,27 @@ impl Best {
         }
         let evidence = evidence(problem, sets, recorder)?;
         let undone = problem.undone.take();
-        if evidence > self.evidence {
+        if total(&evidence) > total(&self.evidence) {
             *self = Self { focal: Some(focal), evidence, undone };
         }
         Ok(())
     }
 }
 
-/// Evidence of quick seeds on these sets of views together.
-fn evidence(problem: &Problem, sets: &[Vec<usize>], recorder: &mut Recorder) -> Result<f64, Error> {
-    let mut evidence = 0.0;
-    for views in sets {
+/// Evidence of a quick seed on each of these sets of views.
+fn evidence(problem: &Problem, sets: &[Vec<usize>], recorder: &mut Recorder) -> Result<Vec<f64>, Error> {
+    let of_set = |views: &Vec<usize>| {
         problem.stopped()?;
         let attempt = attempt::search_block(problem, problem.block(views), QUICK_SEED, recorder)?;
-        if let Some(found) = &attempt.projective {
-            evidence +=
-                f64::max(found.evidence(problem.outlier_density), by_homographies(problem, found).unwrap_or(0.0));
-        }
-    }
-    Ok(evidence)
+        Ok(attempt.projective.as_ref().map_or(0.0, |found| {
+            f64::max(found.evidence(problem.outlier_density), by_homographies(problem, found).unwrap_or(0.0))
+        }))
+    };
+    sets.iter().map(of_set).collect()
+}
+
+fn total(evidence: &[f64]) -> f64 {
+    evidence.iter().sum()
 }
 
 /// Evidence of the homographies between the views of a reconstruction: where a camera only turns or the scene is a
