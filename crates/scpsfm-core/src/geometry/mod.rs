@@ -21,6 +21,7 @@ pub(crate) mod procrustes;
 mod ransac;
 pub(crate) mod resection;
 pub(crate) mod robust_triangulation;
+pub(crate) mod similarity;
 pub mod statistics;
 pub(crate) mod triangulation;
 

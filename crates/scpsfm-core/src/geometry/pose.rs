@@ -24,7 +24,7 @@ const POLISH: usize = 2;
 ///
 /// * `points`: in the world, not on a line
 /// * `seen`: their images `(u, v)` at unit depth
-fn three_points(points: &[Vector3<f64>; SAMPLE], seen: &[Vector2<f64>; SAMPLE]) -> Vec<Pose> {
+pub(super) fn three_points(points: &[Vector3<f64>; SAMPLE], seen: &[Vector2<f64>; SAMPLE]) -> Vec<Pose> {
     let rays = seen.map(|uv| uv.push(1.0).normalize());
     let squared = |k: usize, l: usize| (points[k] - points[l]).norm_squared();
     let (a, b, c) = (squared(1, 2), squared(0, 2), squared(0, 1));

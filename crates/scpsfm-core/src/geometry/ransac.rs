@@ -26,6 +26,11 @@ pub(crate) trait Estimator {
     /// Number of data.
     fn len(&self) -> usize;
 
+    /// Distinct data, [`Self::SAMPLE`] of them.
+    fn sample(&self, rng: &mut ChaCha8Rng) -> Vec<usize> {
+        index::sample(rng, self.len(), Self::SAMPLE).into_vec()
+    }
+
     /// The models that fit a sample of [`Self::SAMPLE`] distinct data.
     fn minimal(&self, sample: &[usize]) -> impl IntoIterator<Item = Self::Model>;
 
@@ -154,7 +159,7 @@ pub(crate) fn estimate<E: Estimator>(
     let mut drawn = 0;
     while drawn < search.wanted && !(drawn % STOP_EVERY == 0 && stop.is_stopped()) {
         drawn += 1;
-        let sample = index::sample(rng, estimator.len(), E::SAMPLE).into_vec();
+        let sample = estimator.sample(rng);
         for model in estimator.minimal(&sample) {
             search.offer(model);
         }

@@ -4,8 +4,7 @@
 use super::growth::Trial;
 use super::model::Model;
 use super::options::{ComponentOptions, GrowthOptions};
-use super::register;
-use super::structure;
+use super::{merging, register, structure};
 use crate::domain::{FocalPrior, Grade};
 use crate::geometry::bundle::metric::Intrinsics;
 use crate::solver::attempt::{self, Attempt, Effort};
@@ -84,6 +83,9 @@ pub fn others(
         register::join(problem, model, component, trials, recorder)?;
         drop_unsupported(problem, model, component, recorder);
         failures = if model.of_component(component).is_empty() { failures + 1 } else { 0 };
+        if let Some(into) = merging::merge(problem, model, component, recorder) {
+            register::join(problem, model, into, trials, recorder)?;
+        }
         for (open, pose) in open.iter_mut().zip(&model.poses) {
             *open &= pose.is_none();
         }

@@ -4,10 +4,11 @@
 //! tracks holds them all. A block that was searched is the seed. Where it is calibrated, view after view is resected
 //! against the points that stand ([`register`], [`growth`]), its tracks are triangulated ([`structure`]), and bundle
 //! adjustment with the calibration free keeps the whole straight ([`adjust`]); where it is not, the same is done
-//! without a calibration ([`projective_growth`]), and the whole is calibrated then. Views that share no tracks with it
-//! become [`components`] of their own under the same calibration. What the whole says of the calibration is graded anew
-//! ([`calibrate`]) and checked between its [`windows`]. This file decides which blocks are tried and what is made of
-//! them; [`extended`] is the metric extension of one.
+//! without a calibration ([`projective_growth`]), and the whole is calibrated then. Views that share too few tracks with
+//! it become [`components`] of their own under the same calibration, and are merged where all that they share tells how
+//! ([`merging`]). What the whole says of the calibration is graded anew ([`calibrate`]) and checked between its
+//! [`windows`]. This file decides which blocks are tried and what is made of them; [`extended`] is the metric extension
+//! of one.
 
 mod adjust;
 mod calibrate;
@@ -15,6 +16,7 @@ mod components;
 mod extended;
 mod growth;
 mod lens;
+mod merging;
 mod model;
 mod options;
 mod own_focals;

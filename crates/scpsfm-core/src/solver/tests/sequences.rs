@@ -31,6 +31,44 @@ fn parted(sequence: &Sequence, at: u32) -> RawInput {
     thinned(sequence, |k| first[sequence.input.track[k] as usize] >= at || sequence.input.view[k] < at)
 }
 
+/// Parts that seven tracks join, of which no view of either sees enough: one reconstruction.
+#[test]
+fn parts_that_share_a_few_tracks_are_merged() {
+    for seed in 0..3 {
+        let options =
+            SequenceOptions { tracks: 600, outliers: 0.2, lifetime: (4, 8), seed, ..SequenceOptions::default() };
+        let sequence = Sequence::generate(&options).expect("valid");
+        let crosses = |track: usize| {
+            let seen = |k: &usize| sequence.input.track[*k] as usize == track;
+            let views: Vec<u32> = (0..sequence.input.x.len()).filter(seen).map(|k| sequence.input.view[k]).collect();
+            let before = views.iter().filter(|&&view| view < 10).count();
+            before >= 2 && views.len() - before >= 2
+        };
+        let links: Vec<usize> =
+            (0..600).filter(|&track| sequence.truth.inlier[track] && crosses(track)).take(7).collect();
+        assert_eq!(links.len(), 7, "seed {seed}");
+        let apart = parted(&sequence, 10);
+        let mut raw = apart.clone();
+        for k in 0..sequence.input.x.len() {
+            let (view, track) = (sequence.input.view[k], sequence.input.track[k]);
+            if view >= 10 && links.contains(&(track as usize)) {
+                raw.view.push(view);
+                raw.track.push(track);
+                raw.x.push(sequence.input.x[k]);
+                raw.y.push(sequence.input.y[k]);
+            }
+        }
+        let solve = |raw: RawInput| {
+            let input = Input::new(raw, &Limits::default(), "sequence").expect("valid input");
+            solved(&input, &SolveSettings { seed, ..SolveSettings::default() })
+        };
+        let (merged, apart) = (solve(raw), solve(apart));
+        assert_eq!((merged.part_count(), apart.part_count()), (1, 2), "seed {seed}: {:?}", merged.warnings);
+        assert_eq!(merged.registered_views().len(), 20, "seed {seed}");
+        assert!(links.iter().all(|&link| merged.tracks.inlier[link]), "seed {seed}");
+    }
+}
+
 #[test]
 fn every_view_is_registered_and_every_observation_judged() {
     for (seed, outliers, radial_k1) in [(0, 0.3, 0.0), (1, 0.5, -0.1)] {
