@@ -43,14 +43,19 @@ pub fn candidate_views(problem: &Problem) -> Vec<Vec<usize>> {
     whole(problem).map_or_else(among_all, |views| vec![views])
 }
 
-/// Sets of views that a reconstruction may begin with, best first: each of one camera, or, of cameras too small for
-/// that, of several together.
+/// Sets of views that a reconstruction may begin with, best first: those of one camera, then those of several together,
+/// for where each camera saw every second view of short tracks, its own hold few.
 pub fn blocks(problem: &Problem) -> Vec<Vec<usize>> {
-    let of_one = match problem.has_own_focals() {
+    let mut found = match problem.has_own_focals() {
         true => Vec::new(),
         false => candidate_views_of_one_camera(problem),
     };
-    if of_one.is_empty() { candidate_views(problem) } else { of_one }
+    for views in candidate_views(problem) {
+        if !found.contains(&views) {
+            found.push(views);
+        }
+    }
+    found
 }
 
 /// The views of the one block of an input whose tracks are complete; see [`complete_views`].

@@ -103,8 +103,7 @@ fn of_blocks(problem: &Problem, recorder: &mut Recorder) -> Result<Ended, Error>
         if blocks.is_whole { ExtensionOptions::DEFAULT.first_subsets.min(subsets.len()) } else { subsets.len() };
     let (cheap, rest) = subsets.split_at(cheap);
     // Nothing else is searched of a whole input with depths: what it has found stands.
-    let mut policy = ExtensionPolicy { keeps_first: !is_quick, calibrates_each: metric.is_some() };
-    let mut best = by_projective_extension(problem, first, policy, cheap, recorder)?;
+    let mut best = by_projective_extension(problem, first, !is_quick, cheap, recorder)?;
     if is_quick && metric.is_none() && !stands(&best) {
         let first = match blocks.by_calibration(problem, false, recorder)? {
             ControlFlow::Break(ended) => return Ok(ended),
@@ -113,8 +112,7 @@ fn of_blocks(problem: &Problem, recorder: &mut Recorder) -> Result<Ended, Error>
             }
             ControlFlow::Continue(ended) => ended.seed(),
         };
-        policy.keeps_first = false;
-        best = by_projective_extension(problem, first, policy, rest, recorder)?;
+        best = by_projective_extension(problem, first, false, rest, recorder)?;
     }
     let best = best.filter(|best| metric.is_none() || best.is_trusted());
     Ok(match (best.map(|best| metric_of(problem, best, recorder)).transpose()?, metric) {
@@ -124,15 +122,6 @@ fn of_blocks(problem: &Problem, recorder: &mut Recorder) -> Result<Ended, Error>
         (_, Some(metric)) => Ended::Extended(metric),
         (found, None) => found.unwrap_or(Ended::Block(None)),
     })
-}
-
-/// What is made of projective extensions.
-#[derive(Debug, Clone, Copy)]
-struct ExtensionPolicy {
-    /// Whether the first attempt stands as it is where its extension leaves too little.
-    keeps_first: bool,
-    /// Whether each is calibrated: the data carry a calibration, and another start may find the better minimum.
-    calibrates_each: bool,
 }
 
 impl Ended {
@@ -243,6 +232,10 @@ fn by_calibrated_blocks(
     recorder.expect_extension();
     for (k, views) in candidates.iter().enumerate() {
         problem.stopped()?;
+        // Blocks of several cameras come last, and determine each of these less well.
+        if problem.cameras_of(views).1.len() > 1 && best.as_ref().is_some_and(|best| best.is_calibrated(problem)) {
+            break;
+        }
         recorder.begin_block(k, candidates.len());
         let attempt = attempt::solve_block(problem, problem.block(views), effort, None, recorder)?;
         if attempt.is_good() {
@@ -273,10 +266,12 @@ fn by_calibrated_blocks(
 
 /// The best of an attempt and of those on these sets of views, each extended to all views without a calibration and,
 /// where it is not known yet, calibrated then; the first that is METRIC.
+///
+/// * `keeps_first`: whether the first attempt stands as it is where its extension leaves too little
 fn by_projective_extension(
     problem: &Problem,
     first: Option<Attempt>,
-    policy: ExtensionPolicy,
+    keeps_first: bool,
     sets: &[Vec<usize>],
     recorder: &mut Recorder,
 ) -> Result<Option<Attempt>, Error> {
@@ -287,7 +282,7 @@ fn by_projective_extension(
     for k in 0..starts {
         problem.stopped()?;
         let (mut attempt, keeps) = match first.take() {
-            Some(attempt) => (attempt, policy.keeps_first),
+            Some(attempt) => (attempt, keeps_first),
             None => {
                 recorder.begin_block(k, starts);
                 let views = &sets[k - (starts - sets.len())];
@@ -303,9 +298,9 @@ fn by_projective_extension(
         let is_known = |best: &Attempt| {
             let is_part = attempt.views().iter().all(|view| best.views().binary_search(view).is_ok());
             let grown = attempt.evidence(problem) / best.evidence(problem);
-            is_part && !best.is_calibrated() && grown < ExtensionOptions::DEFAULT.least_evidence_growth
+            is_part && grown < ExtensionOptions::DEFAULT.least_evidence_growth
         };
-        if !policy.calibrates_each && best.as_ref().is_some_and(is_known) {
+        if best.as_ref().is_some_and(is_known) {
             continue;
         }
         attempt::calibrate(problem, &mut attempt, None, recorder)?;
