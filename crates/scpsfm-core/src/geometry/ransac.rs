@@ -26,7 +26,8 @@ pub(crate) trait Estimator {
     /// Number of data.
     fn len(&self) -> usize;
 
-    /// Distinct data, [`Self::SAMPLE`] of them.
+    /// Distinct data, [`Self::SAMPLE`] of them. Where they are not drawn uniformly, the search ends after more or fewer
+    /// samples than its confidence asks for.
     fn sample(&self, rng: &mut ChaCha8Rng) -> Vec<usize> {
         index::sample(rng, self.len(), Self::SAMPLE).into_vec()
     }

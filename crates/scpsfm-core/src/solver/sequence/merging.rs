@@ -1,82 +1,74 @@
-//! Components that are merged by the tracks they share, however few these are for any one view.
-
-use std::collections::BTreeMap;
+//! Components that are merged by all tracks that they share, where no view sees enough of them to be joined by itself.
 
 use rand::SeedableRng;
 use rand_chacha::ChaCha8Rng;
 
 use super::model::Model;
 use super::structure;
-use crate::geometry::similarity::{self, Sighting, Similarity};
+use crate::geometry::similarity::{self, CrossObservation, Similarity, Support};
 use crate::solver::problem::Problem;
 use crate::solver::recorder::Recorder;
 
 options! {
     /// When components are merged.
     pub struct MergingOptions {
-        /// Tracks that must agree, and sightings. Four sightings of four tracks determine the similarity; each of the
-        /// others agrees with a wrong one by chance in one case of ten thousand, and there are some thousand samples.
-        least_tracks: usize = 5,
-        least_sightings: usize = 8,
-        /// Share of the tracks that may agree which must. Below, the samples do not suffice.
-        least_share: f64 = 0.3,
+        /// Tracks that must agree. Four determine the similarity; each of the other three agrees with a wrong one by
+        /// chance in one case of a thousand, and there are some thousand samples.
+        least_tracks: usize = 7,
+        /// Share of the tracks that they share which must. Tracks of a second body, or of repeated structure, agree with
+        /// something else.
+        least_share: f64 = 0.5,
+        /// Tracks that must agree beside those of any one camera, of which a first determines the scale.
+        least_beside: usize = 3,
+        /// Standard deviation of the logarithm of the scale at most. Adjusting all views together needs a start, and
+        /// takes a tenth.
+        most_sigma_log_scale: f64 = 0.1,
     }
 }
 
 const OPTIONS: MergingOptions = MergingOptions::DEFAULT;
 
-/// Merges a component into another one that shares enough tracks with it, where there is one; that
-/// other one.
+/// Merges a component and another one that shares enough tracks with it, where there is one; the component that both
+/// are then, the one found first.
 ///
-/// Parts of a camera that only turned stay apart: any view that two tracks hold is registered by itself.
+/// Components of a camera that only turned are not merged.
 pub fn merge(problem: &Problem, model: &mut Model, component: u32, recorder: &mut Recorder) -> Option<u32> {
     if model.has_common_centre {
         return None;
     }
-    let mut others = (0..component).filter(|&other| !model.of_component(other).is_empty());
-    let (other, similarity) = others.find_map(|other| Some((other, similarity(problem, model, other, component)?)))?;
-    let views = model.of_component(component);
-    for &view in &views {
-        model.poses[view] = model.poses[view].map(|pose| similarity.pose(&pose));
-        model.component_of[view] = other;
-    }
-    for landmark in model.landmarks.iter_mut().flatten().filter(|landmark| landmark.component == component) {
-        landmark.position = similarity.apply(&landmark.position);
-        landmark.component = other;
-    }
+    let (into, from, similarity) =
+        model.components().into_iter().filter(|&other| other != component).find_map(|other| {
+            let (into, from) = (other.min(component), other.max(component));
+            Some((into, from, similarity(problem, model, into, from)?))
+        })?;
+    let views = model.of_component(from);
+    model.merge(problem, from, into, &similarity);
     structure::triangulate_seen(problem, model, &views, recorder);
-    Some(other)
+    Some(into)
 }
 
-/// What takes the second component to the first.
+/// What takes the second component to the first, where their tracks bear it out.
 fn similarity(problem: &Problem, model: &Model, first: u32, second: u32) -> Option<Similarity> {
-    let (tracks, sightings): (Vec<usize>, Vec<Sighting>) = (0..problem.tracks())
-        .flat_map(|track| sightings(problem, model, first, second, track).map(move |sighting| (track, sighting)))
-        .unzip();
+    let of_track = |track| across(problem, model, first, second, track);
+    let observations: Vec<CrossObservation> = (0..problem.tracks()).flat_map(of_track).collect();
     let mut rng = ChaCha8Rng::seed_from_u64(problem.settings.seed);
-    let found = similarity::robust(&sightings, problem.gate(model.noise), &mut rng, problem.stop)?;
-    // Of each track, how many of its sightings agree, and how many there are.
-    let mut counts: BTreeMap<usize, (usize, usize)> = BTreeMap::new();
-    for (track, agrees) in tracks.iter().zip(&found.inlier) {
-        let (agreeing, all) = counts.entry(*track).or_default();
-        *agreeing += usize::from(*agrees);
-        *all += 1;
-    }
-    let agreeing = counts.values().filter(|(agreeing, all)| 2 * agreeing > *all).count();
-    let is_enough = found.inlier_count() >= OPTIONS.least_sightings
-        && agreeing >= OPTIONS.least_tracks
-        && agreeing as f64 >= OPTIONS.least_share * counts.len() as f64;
-    is_enough.then_some(found.model)
+    let found = similarity::robust(&observations, problem.gate(model.noise), &mut rng, problem.stop)?;
+    let support = Support::new(&observations, &found, model.noise);
+    let stands = support.agreeing >= OPTIONS.least_tracks
+        && support.agreeing as f64 >= OPTIONS.least_share * support.tracks as f64
+        && support.beside_one_camera >= OPTIONS.least_beside
+        && support.sigma_log_scale <= OPTIONS.most_sigma_log_scale;
+    stands.then_some(found.model)
 }
 
-/// What the views of one of two components see of a track whose landmark is in the other.
-fn sightings<'a>(
+/// The observations of a track by views of one of two components, where its landmark is in the other.
+fn across<'a>(
     problem: &'a Problem,
     model: &'a Model,
     first: u32,
     second: u32,
     track: usize,
-) -> impl Iterator<Item = Sighting> + 'a {
+) -> impl Iterator<Item = CrossObservation> + 'a {
     let landmark = model.landmarks[track].filter(|landmark| landmark.supports());
     let across = landmark.and_then(|landmark| match landmark.component {
         of if of == first => Some((landmark, second)),
@@ -89,12 +81,13 @@ fn sightings<'a>(
             let pose = model.poses[view].filter(|_| model.component_of[view] == component)?;
             let intrinsics = model.intrinsics_of(problem, view);
             let undone = intrinsics.undistorted(&problem.observation(k))?;
-            Some(Sighting {
+            Some(CrossObservation {
+                track,
                 camera: view,
                 pose,
                 is_second: component == second,
                 point: landmark.position,
-                seen: intrinsics.pinhole().ray(&undone.xy)?,
+                xy: intrinsics.pinhole().ray(&undone.xy)?,
                 weight: undone.weight * intrinsics.focal.powi(2),
             })
         })

@@ -6,6 +6,7 @@ use super::options::{AdjustmentOptions, GrowthOptions};
 use crate::geometry::Camera;
 use crate::geometry::bundle::metric::{Intrinsics, IntrinsicsModel, MetricReconstruction, Pose};
 use crate::geometry::observation::Observation;
+use crate::geometry::similarity::Similarity;
 use crate::solver::calibration::ViewFocal;
 use crate::solver::problem::Problem;
 
@@ -176,6 +177,29 @@ impl Model {
         if self.own_focals.is_empty() || !lens.is_known {
             lens.intrinsics = intrinsics;
         }
+    }
+
+    /// Components that have views, increasing.
+    pub fn components(&self) -> Vec<u32> {
+        let mut components: Vec<u32> = self.registered().into_iter().map(|view| self.component_of[view]).collect();
+        components.sort_unstable();
+        components.dedup();
+        components
+    }
+
+    /// Takes a component into the frame of another one, and turns to that.
+    ///
+    /// * `similarity`: from the frame of the one to that of the other
+    pub fn merge(&mut self, problem: &Problem, from: u32, into: u32, similarity: &Similarity) {
+        for view in self.of_component(from) {
+            self.poses[view] = self.poses[view].map(|pose| similarity.pose(&pose));
+            self.component_of[view] = into;
+        }
+        for landmark in self.landmarks.iter_mut().flatten().filter(|landmark| landmark.component == from) {
+            landmark.position = similarity.apply(&landmark.position);
+            landmark.component = into;
+        }
+        self.turn_to(problem, into);
     }
 
     /// Takes views back.
