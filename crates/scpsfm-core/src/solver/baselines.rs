@@ -39,7 +39,7 @@ pub fn solve(problem: &Problem, recorder: &mut Recorder) -> Result<Option<Attemp
     for (k, views) in candidates.iter().enumerate() {
         problem.stopped()?;
         recorder.begin_block(k, candidates.len());
-        attempts.push(attempt::solve_block(problem, problem.block(views), Effort::default(), None, recorder)?);
+        attempts.push(attempt::solve_block(problem, problem.block(views), Effort::default(), &[], recorder)?);
         // A good block is still checked against a second one.
         if k > 0 && attempts.iter().any(Attempt::is_good) {
             break;

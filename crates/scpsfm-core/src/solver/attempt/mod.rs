@@ -185,7 +185,8 @@ pub fn are_mixed(mut squared: Vec<f64>) -> bool {
 
 /// Solves a block, or as many of its tracks as its method can afford.
 ///
-/// * `prior`: what is known of the focal length beside what the views bring: what another part of the input said
+/// * `priors`: what is known of the focal length of each camera instead of what its views bring: what another part of the
+///   input said; nothing of a camera beyond the slice
 ///
 /// # Errors
 /// [`Error::Stopped`]; [`Error::Internal`] for defects.
@@ -193,11 +194,11 @@ pub fn solve_block(
     problem: &Problem,
     block: Block,
     effort: Effort,
-    prior: Option<FocalPrior>,
+    priors: &[Option<FocalPrior>],
     recorder: &mut Recorder,
 ) -> Result<Attempt, Error> {
     let mut attempt = search_block(problem, block, effort, recorder)?;
-    calibrate(problem, &mut attempt, prior, recorder)?;
+    calibrate(problem, &mut attempt, priors, recorder)?;
     Ok(attempt)
 }
 
@@ -236,13 +237,13 @@ pub fn search_block(
 pub fn calibrate(
     problem: &Problem,
     attempt: &mut Attempt,
-    prior: Option<FocalPrior>,
+    priors: &[Option<FocalPrior>],
     recorder: &mut Recorder,
 ) -> Result<(), Error> {
     let (Some(consensus), Some(projective)) = (&attempt.found.consensus, &attempt.projective) else { return Ok(()) };
     recorder.enter(Stage::Calibrate);
     attempt.calibration = Some(match attempt.found.verified_by {
-        VerifiedBy::ImagePoints => calibrate_projective(problem, projective, prior)?,
+        VerifiedBy::ImagePoints => calibrate_projective(problem, projective, priors)?,
         VerifiedBy::Depths { focal } => depths::calibrate(problem, &attempt.block.complete, consensus, focal),
     });
     if let Some(intrinsics) = attempt.calibration.as_ref().and_then(Outcome::intrinsics) {
@@ -375,14 +376,13 @@ fn decided(problem: &Problem, block: Block, recorder: &mut Recorder) -> Result<A
 fn calibrate_projective(
     problem: &Problem,
     projective: &ProjectiveReconstruction,
-    prior: Option<FocalPrior>,
+    priors: &[Option<FocalPrior>],
 ) -> Result<Outcome, Error> {
     let most = OPTIONS.most_calibrated.min(OPTIONS.calibrated_observations / projective.views.len().max(1));
     let some = projective.most_observed(most);
     let (group_of, cameras) = problem.cameras_of(&projective.views);
-    let prior = prior.filter(|_| cameras.len() == 1);
-    let focal_priors: Vec<Option<FocalPrior>> =
-        cameras.iter().map(|&camera| prior.or(problem.focal_priors[camera])).collect();
+    let prior = |&camera: &usize| priors.get(camera).copied().flatten().or(problem.focal_priors[camera]);
+    let focal_priors: Vec<Option<FocalPrior>> = cameras.iter().map(prior).collect();
     let to_calibrate = calibration::Uncalibrated {
         cameras: &some.cameras,
         points: &some.points,

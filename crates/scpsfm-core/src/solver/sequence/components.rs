@@ -2,7 +2,7 @@
 //! calibration.
 
 use super::growth::Trial;
-use super::model::Model;
+use super::model::{Lens, Model};
 use super::options::{ComponentOptions, GrowthOptions};
 use super::{merging, register, structure};
 use crate::domain::{FocalPrior, Grade};
@@ -35,7 +35,8 @@ pub fn first(problem: &Problem, seed: &Attempt, recorder: &mut Recorder) -> Mode
     model
 }
 
-/// Solves and extends block after block of the views that are left, as long as there are any.
+/// Solves and extends block after block of the views that are left, as long as there are any: blocks of one camera, then
+/// of several together.
 ///
 /// # Errors
 /// [`Error::Stopped`]; [`Error::Internal`] for defects.
@@ -46,72 +47,96 @@ pub fn others(
     trials: &mut [Trial],
     recorder: &mut Recorder,
 ) -> Result<(), Error> {
-    let first_camera = seed.block.views.first().map_or(0, |&view| problem.camera_of[view]);
-    let prior = prior_of(problem, seed, model, first_camera);
-    let mut open: Vec<bool> = model.poses.iter().map(Option::is_none).collect();
-    let mut failures = 0;
-    for component in FIRST + 1..OPTIONS.most_components {
-        problem.stopped()?;
-        if failures == OPTIONS.most_failures {
-            break;
-        }
-        let Some(views) = next_block(problem, &open) else { break };
-        let known = prior.filter(|_| problem.camera_of[views[0]] == first_camera);
-        recorder.begin_component(component);
-        let attempt = attempt::solve_block(problem, problem.block(&views), SEED, known, recorder)?;
-        recorder.end_component();
-        // Whatever comes of it, a block is tried once.
-        views.iter().for_each(|&view| open[view] = false);
-        // Focal lengths of views that their own block does not determine, no other component can give.
-        let usable = |calibration: &&Outcome| !problem.has_own_focals() || calibration.grade != Grade::ProjectiveOnly;
-        let Some((calibration, metric)) = attempt
-            .calibration
-            .as_ref()
-            .filter(usable)
-            .filter(|_| attempt.has_common_centre() == model.has_common_centre)
-            .filter(|_| {
-                let found = attempt.projective.as_ref();
-                model.of_static || !found.is_some_and(|found| problem.is_of_static(&found.tracks))
-            })
-            .and_then(|calibration| Some((calibration, calibration.metric.as_ref()?)))
-        else {
-            failures += 1;
-            continue;
-        };
-        model.add_component(problem, component, attempt.views(), metric, calibration.focals.as_deref());
-        structure::triangulate_seen(problem, model, attempt.views(), recorder);
-        register::join(problem, model, component, trials, recorder)?;
-        drop_unsupported(problem, model, component, recorder);
-        failures = if model.of_component(component).is_empty() { failures + 1 } else { 0 };
-        if let Some(into) = merging::merge(problem, model, component, recorder) {
-            register::join(problem, model, into, trials, recorder)?;
-        }
-        for (open, pose) in open.iter_mut().zip(&model.poses) {
-            *open &= pose.is_none();
+    let mut component = FIRST;
+    // Of one camera there are no blocks of several.
+    for cameras in [Cameras::One, Cameras::Several].into_iter().take(problem.cameras) {
+        let mut open: Vec<bool> = model.poses.iter().map(Option::is_none).collect();
+        let mut failures = 0;
+        while component + 1 < OPTIONS.most_components && failures < OPTIONS.most_failures {
+            problem.stopped()?;
+            let Some(views) = next_block(problem, &open, cameras) else { break };
+            component += 1;
+            recorder.begin_component(component);
+            let priors = priors(problem, seed, model);
+            let attempt = attempt::solve_block(problem, problem.block(&views), SEED, &priors, recorder)?;
+            recorder.end_component();
+            // Whatever comes of it, a block is tried once.
+            views.iter().for_each(|&view| open[view] = false);
+            let is_added = add(problem, model, component, &attempt, trials, recorder)?;
+            failures = if is_added { 0 } else { failures + 1 };
+            for (open, pose) in open.iter_mut().zip(&model.poses) {
+                *open &= pose.is_none();
+            }
         }
     }
     Ok(())
 }
 
-/// The best block of open views of one camera.
-fn next_block(problem: &Problem, open: &[bool]) -> Option<Vec<usize>> {
-    (0..problem.cameras).find_map(|camera| {
-        let of_camera: Vec<bool> =
-            open.iter().zip(&problem.camera_of).map(|(open, of)| *open && *of == camera).collect();
-        if of_camera.iter().filter(|&&open| open).count() < view_selection::LEAST_VIEWS || problem.stop.is_stopped() {
-            return None;
-        }
-        let found = view_selection::candidate_views_among(problem, &of_camera);
-        found.into_iter().next()
-    })
+/// Adds what was found of a block as a component, joins to it what views it can, and merges it into another one where
+/// it shares enough with that; whether anything stands.
+fn add(
+    problem: &Problem,
+    model: &mut Model,
+    component: u32,
+    attempt: &Attempt,
+    trials: &mut [Trial],
+    recorder: &mut Recorder,
+) -> Result<bool, Error> {
+    // Focal lengths of views that their own block does not determine, no other component can give.
+    let is_usable = |calibration: &&Outcome| !problem.has_own_focals() || calibration.grade != Grade::ProjectiveOnly;
+    let is_of_static = attempt.projective.as_ref().is_some_and(|found| problem.is_of_static(&found.tracks));
+    if attempt.has_common_centre() != model.has_common_centre || is_of_static && !model.of_static {
+        return Ok(false);
+    }
+    let Some(calibration) = attempt.calibration.as_ref().filter(is_usable) else { return Ok(false) };
+    let Some(metric) = &calibration.metric else { return Ok(false) };
+    model.add_component(problem, component, attempt.views(), metric, calibration.focals.as_deref());
+    structure::triangulate_seen(problem, model, attempt.views(), recorder);
+    register::join(problem, model, component, trials, recorder)?;
+    drop_unsupported(problem, model, component, recorder);
+    let stands = !model.of_component(component).is_empty();
+    let mut grown = component;
+    while let Some(into) = merging::merge(problem, model, grown, recorder) {
+        register::join(problem, model, into, trials, recorder)?;
+        grown = into;
+    }
+    Ok(stands)
 }
 
-/// What the first component says of the focal length of the others; nothing where views have their own.
-fn prior_of(problem: &Problem, seed: &Attempt, model: &Model, camera: usize) -> Option<FocalPrior> {
-    let calibration = seed.calibration.as_ref().filter(|_| !problem.has_own_focals())?;
-    let sigma = calibration.sigma_log_focal.filter(|_| calibration.grade != Grade::ProjectiveOnly);
-    let focal_px = model.lenses[camera].intrinsics.focal * problem.scale_px;
-    Some(FocalPrior { focal_px, sigma_log: sigma.map_or(OPTIONS.vague_sigma, |sigma| sigma.max(OPTIONS.prior_sigma)) })
+/// Which views a block may hold.
+#[derive(Debug, Clone, Copy)]
+enum Cameras {
+    One,
+    Several,
+}
+
+/// The best block of open views.
+fn next_block(problem: &Problem, open: &[bool], cameras: Cameras) -> Option<Vec<usize>> {
+    let among = |open: &[bool]| {
+        let is_worth = open.iter().filter(|open| **open).count() >= view_selection::LEAST_VIEWS;
+        let found = || view_selection::candidate_views_among(problem, open).into_iter().next();
+        (is_worth && !problem.stop.is_stopped()).then(found).flatten()
+    };
+    match cameras {
+        Cameras::One => (0..problem.cameras).find_map(|camera| {
+            let is_open = |(open, of): (&bool, &usize)| *open && *of == camera;
+            among(&open.iter().zip(&problem.camera_of).map(is_open).collect::<Vec<bool>>())
+        }),
+        Cameras::Several => among(open),
+    }
+}
+
+/// What the components that stand say of the focal length of each camera that they have; nothing where views have their
+/// own.
+fn priors(problem: &Problem, seed: &Attempt, model: &Model) -> Vec<Option<FocalPrior>> {
+    let calibration = seed.calibration.as_ref().filter(|_| !problem.has_own_focals());
+    let of_camera = |lens: &Lens| {
+        let calibration = calibration.filter(|_| lens.is_known)?;
+        let sigma = calibration.sigma_log_focal.filter(|_| calibration.grade != Grade::ProjectiveOnly);
+        let sigma_log = sigma.map_or(OPTIONS.vague_sigma, |sigma| sigma.max(OPTIONS.prior_sigma));
+        Some(FocalPrior { focal_px: lens.intrinsics.focal * problem.scale_px, sigma_log })
+    };
+    model.lenses.iter().map(of_camera).collect()
 }
 
 /// Takes back the views of a component that see too few of its points to be held by them, and the whole component if

@@ -216,7 +216,7 @@ fn of_whole(problem: &Problem, views: &[usize], is_quick: bool, recorder: &mut R
     if views.len() < problem.observed_views().len() || !attempt.judges_observations() {
         extend_projectively(problem, &mut attempt, true, recorder)?;
     }
-    attempt::calibrate(problem, &mut attempt, None, recorder)?;
+    attempt::calibrate(problem, &mut attempt, &[], recorder)?;
     Ok(attempt)
 }
 
@@ -232,12 +232,14 @@ fn by_calibrated_blocks(
     recorder.expect_extension();
     for (k, views) in candidates.iter().enumerate() {
         problem.stopped()?;
-        // Blocks of several cameras come last, and determine each of these less well.
-        if problem.cameras_of(views).1.len() > 1 && best.as_ref().is_some_and(|best| best.is_calibrated(problem)) {
-            break;
+        // A block of several cameras determines each of them less well than one of its own.
+        let is_of_one = |views: &[usize]| problem.cameras_of(views).1.len() == 1;
+        let begun = best.as_ref().filter(|best| best.is_calibrated(problem));
+        if !is_of_one(views) && begun.is_some_and(|best| is_of_one(&best.seed.block.views)) {
+            continue;
         }
         recorder.begin_block(k, candidates.len());
-        let attempt = attempt::solve_block(problem, problem.block(views), effort, None, recorder)?;
+        let attempt = attempt::solve_block(problem, problem.block(views), effort, &[], recorder)?;
         if attempt.is_good() {
             let extended = extend(problem, attempt, recorder)?;
             if !extended.stands() {
@@ -303,7 +305,7 @@ fn by_projective_extension(
         if best.as_ref().is_some_and(is_known) {
             continue;
         }
-        attempt::calibrate(problem, &mut attempt, None, recorder)?;
+        attempt::calibrate(problem, &mut attempt, &[], recorder)?;
         let rank = |attempt: &Attempt| (attempt.is_calibrated(), attempt.evidence(problem));
         if best.as_ref().is_none_or(|best| rank(&attempt) > rank(best)) {
             best = Some(attempt);
@@ -356,7 +358,7 @@ fn finished(problem: &Problem, mut attempt: Attempt, recorder: &mut Recorder) ->
     }
     if !attempt.has_metric() {
         extend_projectively(problem, &mut attempt, true, recorder)?;
-        attempt::calibrate(problem, &mut attempt, None, recorder)?;
+        attempt::calibrate(problem, &mut attempt, &[], recorder)?;
     }
     metric_of(problem, attempt, recorder)
 }

@@ -31,41 +31,47 @@ fn parted(sequence: &Sequence, at: u32) -> RawInput {
     thinned(sequence, |k| first[sequence.input.track[k] as usize] >= at || sequence.input.view[k] < at)
 }
 
-/// Parts that seven tracks join, of which no view of either sees enough: one reconstruction.
+/// Parts that twelve tracks link, of which each view sees half: one reconstruction, and none where the links are wrong.
 #[test]
 fn parts_that_share_a_few_tracks_are_merged() {
     for seed in 0..3 {
         let options =
             SequenceOptions { tracks: 600, outliers: 0.2, lifetime: (4, 8), seed, ..SequenceOptions::default() };
         let sequence = Sequence::generate(&options).expect("valid");
+        let from = &sequence.input;
         let crosses = |track: usize| {
-            let seen = |k: &usize| sequence.input.track[*k] as usize == track;
-            let views: Vec<u32> = (0..sequence.input.x.len()).filter(seen).map(|k| sequence.input.view[k]).collect();
-            let before = views.iter().filter(|&&view| view < 10).count();
-            before >= 2 && views.len() - before >= 2
+            let views = (0..from.x.len()).filter(|&k| from.track[k] as usize == track).map(|k| from.view[k]);
+            let (before, after): (Vec<u32>, Vec<u32>) = views.partition(|&view| view < 10);
+            before.len() >= 3 && after.len() >= 2
         };
         let links: Vec<usize> =
-            (0..600).filter(|&track| sequence.truth.inlier[track] && crosses(track)).take(7).collect();
-        assert_eq!(links.len(), 7, "seed {seed}");
-        let apart = parted(&sequence, 10);
-        let mut raw = apart.clone();
-        for k in 0..sequence.input.x.len() {
-            let (view, track) = (sequence.input.view[k], sequence.input.track[k]);
-            if view >= 10 && links.contains(&(track as usize)) {
-                raw.view.push(view);
-                raw.track.push(track);
-                raw.x.push(sequence.input.x[k]);
-                raw.y.push(sequence.input.y[k]);
+            (0..600).filter(|&track| sequence.truth.inlier[track] && crosses(track)).take(12).collect();
+        assert_eq!(links.len(), 12, "seed {seed}");
+        let solve = |wrong: bool| {
+            let mut raw = parted(&sequence, 10);
+            for k in 0..from.x.len() {
+                let (view, track) = (from.view[k], from.track[k]);
+                let link = links.iter().position(|&link| link == track as usize);
+                if let Some(link) = link.filter(|link| view >= 10 && (view as usize + link).is_multiple_of(2)) {
+                    let by = if wrong { 137.0 * (link + 1) as f64 } else { 0.0 };
+                    raw.view.push(view);
+                    raw.track.push(track);
+                    raw.x.push((from.x[k] + by).rem_euclid(1000.0));
+                    raw.y.push(from.y[k]);
+                }
             }
-        }
-        let solve = |raw: RawInput| {
             let input = Input::new(raw, &Limits::default(), "sequence").expect("valid input");
-            solved(&input, &SolveSettings { seed, ..SolveSettings::default() })
+            let solution = solved(&input, &SolveSettings { seed, ..SolveSettings::default() });
+            assert_eq!(solution.registered_views().len(), 20, "seed {seed}: {:?}", solution.warnings);
+            let is_link = |k: &usize| links.contains(&input.track_of(*k)) && input.view_of(*k) >= 10;
+            let of_links: Vec<usize> = (0..input.observation_count()).filter(is_link).collect();
+            let kept = of_links.iter().filter(|&&k| solution.observations.inlier[input.caller_index(k)]).count();
+            (solution.part_count(), kept, of_links.len())
         };
-        let (merged, apart) = (solve(raw), solve(apart));
-        assert_eq!((merged.part_count(), apart.part_count()), (1, 2), "seed {seed}: {:?}", merged.warnings);
-        assert_eq!(merged.registered_views().len(), 20, "seed {seed}");
-        assert!(links.iter().all(|&link| merged.tracks.inlier[link]), "seed {seed}");
+        let (parts, kept, links) = solve(false);
+        println!("seed {seed}: {parts} parts, {kept} of {links} links kept");
+        assert!(parts == 1 && kept + 2 >= links, "seed {seed}: {parts} parts, {kept} of {links} links kept");
+        assert_eq!(solve(true).0, 2, "seed {seed}: parts with wrong links");
     }
 }
 
@@ -360,7 +366,9 @@ fn views_of_a_zoom_that_do_not_turn_have_no_focal_length() {
     }
     let points = || held.iter().zip(&solution.tracks.point);
     assert!(points().all(|(views, point)| point.is_none() || *views >= 2));
-    assert!(points().filter(|(_, point)| point.is_some()).count() > 1_000);
+    // Half of the right tracks, where two thirds of the views have a focal length.
+    let with_point = points().filter(|(_, point)| point.is_some()).count();
+    assert!(with_point > 900, "{with_point} points");
     // A few that do not turn are held by those beside them that do.
     assert!((75..=95).contains(&told), "{told} of 120 views");
     let said = format!("only {told} of 120 views determine their focal length");
