@@ -38,8 +38,9 @@ const OPTIONS: AllTracksOptions = AllTracksOptions::DEFAULT;
 /// was found does not carry over.
 pub fn extend(problem: &Problem, searched: &Block, consensus: &Consensus) -> Option<(Block, Consensus)> {
     let mut block = near_duplicates::without(problem, problem.block(&searched.views));
-    if !problem.is_of_static(&searched.tracks) {
-        block = static_tracks::without(problem, &block).unwrap_or(block);
+    let found: Vec<usize> = consensus.inliers().into_iter().map(|track| searched.tracks[track]).collect();
+    if !problem.is_of_static(&found) {
+        block = static_tracks::moving(problem, &block);
     }
     let all = block.sample_with(OPTIONS.most_tracks, problem.settings.seed, &searched.tracks);
     if all.tracks.len() == searched.tracks.len() {

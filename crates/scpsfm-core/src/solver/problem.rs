@@ -234,9 +234,9 @@ impl<'a> Problem<'a> {
         self.representative[track] != track
     }
 
-    /// Whether a reconstruction began from static tracks: whether these, which it is of, hold any.
+    /// Whether a reconstruction of these tracks is one of static tracks: whether most of them are.
     pub fn is_of_static(&self, tracks: &[usize]) -> bool {
-        tracks.iter().any(|&track| self.is_static[track])
+        2 * tracks.iter().filter(|&&track| self.is_static[track]).count() > tracks.len()
     }
 
     /// Whether a track may support cameras until all are judged: not where another represents it, nor where it is static,

@@ -58,8 +58,15 @@ pub fn find(ranges: &[usize], xy: &[Vector2<f64>]) -> Vec<bool> {
 
 /// The block without static tracks; `None` where it has none, or too little beside them.
 pub fn without(problem: &Problem, block: &Block) -> Option<Block> {
+    let moving = moving(problem, block);
+    let count = moving.tracks.len();
+    (count < block.tracks.len() && count >= OPTIONS.least_moving).then_some(moving)
+}
+
+/// The block without static tracks.
+pub fn moving(problem: &Problem, block: &Block) -> Block {
     let kept: Vec<usize> = (0..block.tracks.len()).filter(|&k| !problem.is_static[block.tracks[k]]).collect();
-    (kept.len() < block.tracks.len() && kept.len() >= OPTIONS.least_moving).then(|| block.select(&kept))
+    block.select(&kept)
 }
 
 /// What is said of static tracks that are no part of the scene; `None` of few.

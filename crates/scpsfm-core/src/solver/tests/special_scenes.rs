@@ -160,7 +160,7 @@ fn what_is_static_in_the_image_is_not_the_scene() {
     }
 }
 
-/// A camera that does not turn sees what is infinitely far away where it stays: not nearly half of what it sees.
+/// A camera that does not turn sees points infinitely far away at one place of the image, as it does a watermark.
 #[test]
 fn what_is_static_before_a_camera_that_does_not_turn_is_not_the_scene_either() {
     for seed in 0..3 {
