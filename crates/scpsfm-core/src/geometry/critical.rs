@@ -26,9 +26,14 @@ const DEPTH_ROUNDS: usize = 10;
 /// Iterations of each adjustment: they start near the minimum, or the model is wrong and its cost only has to show it.
 const ITERATIONS: usize = 30;
 
-/// Share of what homographies miss of a point from which one observation makes up nearly all of it.
+/// Share of the squared residuals of a point from which one observation makes up nearly all: three times as far off as
+/// all others together.
 const ALONE_SHARE: f64 = 0.9;
-/// Share of a view's observations up to which those are a minority: homographies explain views by three quarters.
+/// Observations of a point up to which one of them is not compared with the others: the one in the reference view has no
+/// residual, and beside a second one that hardly moved, true depth would show in the third alone.
+const LEAST_COMPARED: usize = 3;
+/// Share of a view's observations up to which those are a minority. Homographies explain views whose points fit but for
+/// the worst quarter, see [`median_residual`](super::homography::median_residual).
 const MOST_ALONE: f64 = 0.25;
 
 /// A model at its minimum.
@@ -63,16 +68,18 @@ impl ReferenceHomographies {
         Some(Self { views: homographies, positions })
     }
 
-    /// The observations that tell of depth and that no other bears out, one entry an observation. What noise explains
-    /// is never among them.
+    /// Which observations show a depth that nothing else confirms. Never those that noise explains.
     ///
-    /// Behind homographies the fourth columns of the cameras are free. That of a view takes up any one track, wrong or
-    /// right: of points of which each alone makes up most of what the homographies miss in most of its views, all
-    /// observations are among them. Scaled up, it takes up whatever slid along its epipolar lines in that view alone,
-    /// for the points need next to no depth then: of other points an observation is among them that makes up nearly all
-    /// that is missed of its point, in views where these are a minority.
+    /// Behind homographies the fourth columns of the cameras are free. That of one view fits any one track, wrong or
+    /// right: all observations of a point are unsupported that alone makes up most of the squared residuals of
+    /// homographies in most of its views. Scaled up, it fits every track that slid along the epipolar lines of that
+    /// view, and the points need hardly any depth for it: an observation is unsupported that makes up nearly all of the
+    /// squared residuals of its point, in a view where these are a minority.
     ///
     /// * `noise`: one standard deviation of a coordinate, normalised units
+    ///
+    /// # Pitfall
+    /// Points are where the reference view sees them: what slid in that view is not found.
     pub fn unsupported(&self, observations: &[Observation], noise: f64) -> Vec<bool> {
         let is_usable = |seen: &Observation| seen.is_usable(self.views.len(), self.positions.len());
         let missed = |seen: &Observation| {
@@ -94,17 +101,18 @@ impl ReferenceHomographies {
         let (mut dominant, mut alone) = (vec![0; self.positions.len()], vec![0; self.views.len()]);
         let is_alone = |seen: &Observation, missed: f64| {
             let (of_point, observed) = of_point[seen.point];
-            observed > 2 && missed > by_noise && missed > ALONE_SHARE * of_point
+            observed > LEAST_COMPARED && missed > by_noise && missed > ALONE_SHARE * of_point
         };
         for (seen, missed) in found() {
             dominant[seen.point] += usize::from(missed > by_noise && missed > of_view[seen.view].0 / 2.0);
             alone[seen.view] += usize::from(is_alone(seen, missed));
         }
         let is_unsupported = |(seen, missed): (&Observation, &Option<f64>)| {
-            missed.is_some_and(|missed| {
-                let is_minority = alone[seen.view] as f64 <= MOST_ALONE * of_view[seen.view].1 as f64;
-                2 * dominant[seen.point] > of_point[seen.point].1 || is_minority && is_alone(seen, missed)
-            })
+            is_usable(seen) && 2 * dominant[seen.point] > of_point[seen.point].1
+                || missed.is_some_and(|missed| {
+                    let is_minority = alone[seen.view] as f64 <= MOST_ALONE * of_view[seen.view].1 as f64;
+                    is_minority && is_alone(seen, missed)
+                })
         };
         observations.iter().zip(&missed).map(is_unsupported).collect()
     }
