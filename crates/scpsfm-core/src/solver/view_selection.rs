@@ -43,13 +43,15 @@ pub fn candidate_views(problem: &Problem) -> Vec<Vec<usize>> {
     whole(problem).map_or_else(among_all, |views| vec![views])
 }
 
-/// Sets of views that a reconstruction may begin with, best first: those of one camera, then those of several together,
-/// for where each camera saw every second view of short tracks, its own hold few.
+/// Sets of views that a reconstruction may begin with, best first: those of one camera, then those of several together.
+/// Of cameras that took pictures in turn, one alone sees short tracks half as often.
+///
+/// At most [`ViewSelectionOptions::most_blocks`] of either.
 pub fn blocks(problem: &Problem) -> Vec<Vec<usize>> {
-    let mut found = match problem.has_own_focals() {
-        true => Vec::new(),
-        false => candidate_views_of_one_camera(problem),
-    };
+    if problem.cameras == 1 {
+        return candidate_views(problem);
+    }
+    let mut found = candidate_views_of_one_camera(problem);
     for views in candidate_views(problem) {
         if !found.contains(&views) {
             found.push(views);

@@ -79,8 +79,9 @@ pub fn undo(problem: &mut Problem, ended: &Ended, recorder: &mut Recorder) -> Re
             }
         }
         let least = total_of_pinhole + OPTIONS.least_gain.max(OPTIONS.least_share * total_of_pinhole);
-        // A seed of few tracks may find others by chance, but hardly every one.
-        let gains_everywhere = best.evidence.iter().zip(&of_pinhole).all(|(own, of_pinhole)| own >= of_pinhole);
+        // A seed of few tracks may find another set of them by chance and gain by it, but hardly each seed does.
+        let gains = |(own, of_pinhole): (&f64, &f64)| *own > of_pinhole - OPTIONS.least_gain;
+        let gains_everywhere = best.evidence.iter().zip(&of_pinhole).all(gains);
         let is_taken = gains_everywhere && total(&best.evidence) > least;
         problem.undone = best.undone.filter(|_| is_taken).or(without);
     }

@@ -108,8 +108,9 @@ options! {
         worth_extending: f64 = 1.1,
         /// Subsets of a whole input that are tried before it is searched at length.
         first_subsets: usize = 3,
-        /// Evidence of a reconstruction, in that of one of the same views without a calibration, from which it is
+        /// Evidence of a reconstruction, in that of one that was calibrated and has all of its views, from which it is
         /// calibrated too. One that holds the same tracks differs by a few observations; a fiftieth more are others.
+        /// Calibrating each changed no grade of 160 scenes, and took five times as long where it took longest.
         least_evidence_growth: f64 = 1.02,
     }
 }
