@@ -29,9 +29,9 @@ const ITERATIONS: usize = 30;
 /// Share of the squared residuals of a point from which one observation makes up nearly all: three times as far off as
 /// all others together.
 const ALONE_SHARE: f64 = 0.9;
-/// Observations of a point up to which one of them is not compared with the others: the one in the reference view has no
-/// residual, and beside a second one that hardly moved, true depth would show in the third alone.
-const LEAST_COMPARED: usize = 3;
+/// Observations of a point from which one of them is compared with the others. Of three, the one in the reference view
+/// has no residual, and beside a second one that hardly moved, true depth would show in the third alone.
+const LEAST_COMPARED: usize = 4;
 /// Share of a view's observations up to which those are a minority. Homographies explain views whose points fit but for
 /// the worst quarter, see [`median_residual`](super::homography::median_residual).
 const MOST_ALONE: f64 = 0.25;
@@ -101,7 +101,7 @@ impl ReferenceHomographies {
         let (mut dominant, mut alone) = (vec![0; self.positions.len()], vec![0; self.views.len()]);
         let is_alone = |seen: &Observation, missed: f64| {
             let (of_point, observed) = of_point[seen.point];
-            observed > LEAST_COMPARED && missed > by_noise && missed > ALONE_SHARE * of_point
+            observed >= LEAST_COMPARED && missed > by_noise && missed > ALONE_SHARE * of_point
         };
         for (seen, missed) in found() {
             dominant[seen.point] += usize::from(missed > by_noise && missed > of_view[seen.view].0 / 2.0);

@@ -17,8 +17,8 @@ use super::pose;
 use super::ransac::{self, Estimator, Refinable, RobustModel};
 use crate::domain::StopToken;
 
-/// Samples at most. Of observations of which half are right, one sample in sixteen is; cameras differ in how many of
-/// theirs are.
+/// Samples at most. Where half of the observations are right, one sample in sixteen is, and seventy suffice; where a
+/// quarter of a camera's are, one in 256 is, and 1,200 suffice.
 const MOST_SAMPLES: usize = 2_000;
 /// Observations of one camera that determine its pose.
 const OF_CAMERA: usize = 3;
@@ -146,7 +146,7 @@ impl Estimator for CrossObservations<'_> {
     type Model = Similarity;
 
     const SAMPLE: usize = OF_CAMERA + 1;
-    const SAMPLE_GATES: f64 = 4.0;
+    const SAMPLE_GATES: f64 = pose::Correspondences::SAMPLE_GATES;
 
     fn len(&self) -> usize {
         self.observations.len()

@@ -39,8 +39,9 @@ const OPTIONS: AllTracksOptions = AllTracksOptions::DEFAULT;
 pub fn extend(problem: &Problem, searched: &Block, consensus: &Consensus) -> Option<(Block, Consensus)> {
     let mut block = near_duplicates::without(problem, problem.block(&searched.views));
     let found: Vec<usize> = consensus.inliers().into_iter().map(|track| searched.tracks[track]).collect();
-    if !problem.is_of_static(&found) {
-        block = static_tracks::moving(problem, &block);
+    let moving = static_tracks::moving(problem, &block);
+    if moving.len() < block.tracks.len() && !problem.is_of_static(&found) {
+        block = block.select(&moving);
     }
     let all = block.sample_with(OPTIONS.most_tracks, problem.settings.seed, &searched.tracks);
     if all.tracks.len() == searched.tracks.len() {

@@ -59,14 +59,12 @@ pub fn find(ranges: &[usize], xy: &[Vector2<f64>]) -> Vec<bool> {
 /// The block without static tracks; `None` where it has none, or too little beside them.
 pub fn without(problem: &Problem, block: &Block) -> Option<Block> {
     let moving = moving(problem, block);
-    let count = moving.tracks.len();
-    (count < block.tracks.len() && count >= OPTIONS.least_moving).then_some(moving)
+    (moving.len() < block.tracks.len() && moving.len() >= OPTIONS.least_moving).then(|| block.select(&moving))
 }
 
-/// The block without static tracks.
-pub fn moving(problem: &Problem, block: &Block) -> Block {
-    let kept: Vec<usize> = (0..block.tracks.len()).filter(|&k| !problem.is_static[block.tracks[k]]).collect();
-    block.select(&kept)
+/// The tracks of a block that are not static, by their place in it.
+pub fn moving(problem: &Problem, block: &Block) -> Vec<usize> {
+    (0..block.tracks.len()).filter(|&k| !problem.is_static[block.tracks[k]]).collect()
 }
 
 /// What is said of static tracks that are no part of the scene; `None` of few.

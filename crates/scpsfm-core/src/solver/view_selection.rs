@@ -2,7 +2,7 @@
 //! tracks, and small subsets of either.
 
 use super::grow::LEAST_INLIERS;
-use super::problem::{Problem, camera_groups, observed_views};
+use super::problem::{Problem, observed_views};
 use crate::domain::Input;
 
 /// Views below which a projective reconstruction carries no calibration worth searching for.
@@ -65,16 +65,15 @@ pub fn whole(problem: &Problem) -> Option<Vec<usize>> {
     complete_views(problem.input, &problem.ranges).map(|views| evenly(&views, OPTIONS.most_views_whole))
 }
 
-/// The same of incomplete tracks, each set of one camera group: those of the group with most observations first.
+/// The same of incomplete tracks, each set of one camera: those of the camera with most observations first.
 fn candidate_views_of_one_camera(problem: &Problem) -> Vec<Vec<usize>> {
-    let (group_of, groups) = camera_groups(problem.input);
-    let mut observed = vec![0usize; groups];
-    problem.of_view.iter().zip(&group_of).for_each(|(seen, &group)| observed[group] += seen.len());
-    let mut order: Vec<usize> = (0..groups).collect();
-    order.sort_by_key(|&group| (std::cmp::Reverse(observed[group]), group));
+    let mut observed = vec![0usize; problem.cameras];
+    problem.of_view.iter().zip(&problem.camera_of).for_each(|(seen, &camera)| observed[camera] += seen.len());
+    let mut order: Vec<usize> = (0..problem.cameras).collect();
+    order.sort_by_key(|&camera| (std::cmp::Reverse(observed[camera]), camera));
     let mut found: Vec<Vec<usize>> = Vec::new();
-    for group in order {
-        let open: Vec<bool> = group_of.iter().map(|of| *of == group).collect();
+    for camera in order {
+        let open: Vec<bool> = problem.camera_of.iter().map(|of| *of == camera).collect();
         let enough = open.iter().filter(|&&open| open).count() >= LEAST_VIEWS;
         if enough && found.len() < OPTIONS.most_blocks && !problem.stop.is_stopped() {
             found.extend(candidate_views_among(problem, &open));
@@ -238,6 +237,22 @@ mod tests {
         assert_eq!((sampled.tracks.len(), sampled.complete.tracks()), (7, 7));
         let place = block.tracks.iter().position(|&track| track == sampled.tracks[3]).expect("a track of the block");
         assert_eq!(sampled.complete.point(2, 3), block.complete.point(2, place));
+    }
+
+    /// Two cameras that took pictures in turn, of tracks of seven views: either sees three or four of these.
+    #[test]
+    fn blocks_of_one_camera_come_before_those_of_several() {
+        let tracks: Vec<Vec<usize>> = (0..60).map(|track| (track % 6..track % 6 + 7).collect()).collect();
+        let mut raw = input(12, &tracks).to_raw();
+        raw.views.iter_mut().enumerate().for_each(|(view, of)| of.camera_group = 3 + view as u32 % 2);
+        let input = Input::new(raw, &Limits::default(), "test").expect("valid");
+        let (found, cameras) = with_problem(&input, |problem| {
+            let found = blocks(problem);
+            let cameras: Vec<usize> = found.iter().map(|views| problem.cameras_of(views).1.len()).collect();
+            (found, cameras)
+        });
+        assert!(cameras.contains(&1) && cameras.contains(&2) && cameras.is_sorted(), "{cameras:?} of {found:?}");
+        assert!((1..found.len()).all(|k| !found[..k].contains(&found[k])), "{found:?}");
     }
 
     #[test]

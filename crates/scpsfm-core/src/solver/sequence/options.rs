@@ -110,7 +110,7 @@ options! {
         first_subsets: usize = 3,
         /// Evidence of a reconstruction, in that of one that was calibrated and has all of its views, from which it is
         /// calibrated too. One that holds the same tracks differs by a few observations; a fiftieth more are others.
-        /// Calibrating each changed no grade of 160 scenes, and took five times as long where it took longest.
+        /// Calibrating each took 140 s instead of 26 where it took longest, for the same grade.
         least_evidence_growth: f64 = 1.02,
     }
 }
