@@ -12,7 +12,7 @@ use super::ransac::{self, Estimator, RobustModel};
 use crate::domain::StopToken;
 
 /// Correspondences that determine a fundamental matrix linearly.
-const LEAST_MATCHES: usize = 8;
+pub const LEAST_MATCHES: usize = 8;
 /// Samples of the robust estimate at most: enough where 43 % of the matches are right. At ninety per cent outliers
 /// 10⁸ would be, which nobody waits for.
 const MOST_SAMPLES: usize = 4_000;
@@ -64,6 +64,19 @@ impl Fundamental {
     /// That of two views that are not turned to each other, `[e]ₓ`.
     pub(super) fn of_translation(epipole: Vector3<f64>) -> Self {
         Self { matrix: epipole.cross_matrix(), epipole }
+    }
+
+    /// `F`, of rank 2 and unit norm.
+    pub(super) fn matrix(&self) -> &Matrix3<f64> {
+        &self.matrix
+    }
+
+    /// A pair of cameras that have it, that of the view `from` first (Hartley & Zisserman, result 9.14).
+    pub(super) fn cameras(&self) -> [Camera; 2] {
+        let mut to = Camera::zeros();
+        to.fixed_columns_mut::<3>(0).copy_from(&(self.epipole.cross_matrix() * self.matrix));
+        to.set_column(3, &self.epipole);
+        [Camera::identity(), to]
     }
 
     /// Squared Sampson distance of a match (Hartley & Zisserman, eq. 11.9): to first order its squared distance in the

@@ -23,6 +23,7 @@ pub(crate) mod resection;
 pub(crate) mod robust_triangulation;
 pub(crate) mod similarity;
 pub mod statistics;
+pub(crate) mod three_views;
 pub(crate) mod triangulation;
 
 use nalgebra::{Matrix3x4, Vector4};

@@ -270,8 +270,8 @@ fn why_unsolved(problem: &Problem, best: Option<&Attempt>) -> Warning {
         None => Warning::new(
             WarningCode::FewInliers,
             format!(
-                "no {} views share enough tracks: at least {}, no two of them equal, must be seen in all of them",
-                LEAST_VIEWS, LEAST_INLIERS
+                "no {LEAST_VIEWS} views share enough tracks: at least {LEAST_INLIERS}, no two of them equal, must be \
+                 seen in all of them, or more in every two of them",
             ),
         ),
         // All 0: too little is observed for a head to run.

@@ -125,18 +125,26 @@ impl<'a> Problem<'a> {
             let views = input.views().iter().zip(&camera_of).filter(|(_, of)| **of == camera);
             focal_prior(views.map(|(view, _)| view)).filter(|_| !settings.focal_per_view)
         };
+        let representative: Vec<usize> = match is_searched(settings) {
+            true => near_duplicates::representatives(&ranges, |k| input.view_of(k), &xy, initial_noise, stop),
+            false => (0..input.track_count()).collect(),
+        };
+        // Where many tracks are copies of one, their spread is that of the copies.
+        let is_distinct = |k: &u32| {
+            let track = input.track_of(*k as usize);
+            representative[track] == track
+        };
+        let distinct: Vec<Vec<u32>> =
+            of_view.iter().map(|seen| seen.iter().copied().filter(is_distinct).collect()).collect();
         Self {
             focal_priors: (0..cameras).map(of_camera).collect(),
-            outlier_density: classification::outlier_density(&of_view, &xy),
+            outlier_density: classification::outlier_density(&distinct, &xy),
             least_share: if complete_views(input, &ranges).is_some() { LEAST_RETAINED_SHARE } else { 0.0 },
             is_static: match is_searched(settings) {
                 true => static_tracks::find(&ranges, &xy),
                 false => vec![false; input.track_count()],
             },
-            representative: match is_searched(settings) {
-                true => near_duplicates::representatives(&ranges, |k| input.view_of(k), &xy, initial_noise, stop),
-                false => (0..input.track_count()).collect(),
-            },
+            representative,
             initial_noise,
             input,
             settings,

@@ -1,9 +1,12 @@
 //! Which views are searched together: all of them where their tracks are complete, blocks of views that share many
 //! tracks, and small subsets of either.
 
+use std::cmp::Reverse;
+
 use super::grow::LEAST_INLIERS;
 use super::problem::{Problem, observed_views};
 use crate::domain::Input;
+use crate::geometry::fundamental;
 
 /// Views below which a projective reconstruction carries no calibration worth searching for.
 pub const LEAST_VIEWS: usize = 3;
@@ -25,6 +28,10 @@ options! {
         most_first_views: usize = 64,
         /// Blocks that are tried, best first, before the best result stands.
         most_blocks: usize = 4,
+        /// Pairs of views, those with most tracks in common, that triplets are made of, and triplets that are tried. A
+        /// tenth of a second each.
+        most_pairs: usize = 200,
+        most_triplets: usize = 12,
         /// Views of a subset. Of a track with three wrong observations of ten, four views are clean one time in six.
         subset_views: usize = 4,
         /// Subsets of one set, and of all sets together.
@@ -70,7 +77,7 @@ fn candidate_views_of_one_camera(problem: &Problem) -> Vec<Vec<usize>> {
     let mut observed = vec![0usize; problem.cameras];
     problem.of_view.iter().zip(&problem.camera_of).for_each(|(seen, &camera)| observed[camera] += seen.len());
     let mut order: Vec<usize> = (0..problem.cameras).collect();
-    order.sort_by_key(|&camera| (std::cmp::Reverse(observed[camera]), camera));
+    order.sort_by_key(|&camera| (Reverse(observed[camera]), camera));
     let mut found: Vec<Vec<usize>> = Vec::new();
     for camera in order {
         let open: Vec<bool> = problem.camera_of.iter().map(|of| *of == camera).collect();
@@ -110,6 +117,45 @@ pub fn subsets(sets: &[Vec<usize>]) -> Vec<Vec<usize>> {
     }
     found.truncate(OPTIONS.most_subsets);
     found
+}
+
+/// Three views of which every two share tracks, best first: where the two with fewest share most. The tracks of either
+/// pair need not be those of another.
+///
+/// * At least one more than determine a fundamental matrix.
+pub fn triplets(problem: &Problem) -> Vec<[usize; 3]> {
+    let views = problem.views();
+    let mut shared = vec![0u32; views * views];
+    for track in (0..problem.tracks()).filter(|&track| problem.supports_growth(track, false)) {
+        if problem.stop.is_stopped() {
+            break;
+        }
+        let seen: Vec<usize> = problem.of_track(track).map(|k| problem.view_of(k)).collect();
+        for (k, a) in seen.iter().enumerate() {
+            seen[..k].iter().for_each(|b| {
+                shared[a * views + b] += 1;
+                shared[b * views + a] += 1;
+            });
+        }
+    }
+    let shared = |a: usize, b: usize| shared[a * views + b] as usize;
+    let is_enough = |count: usize| count > fundamental::LEAST_MATCHES;
+    let pairs = (0..views).flat_map(|b| (0..b).map(move |a| (a, b))).filter(|&(a, b)| is_enough(shared(a, b)));
+    let mut pairs: Vec<(usize, usize)> = pairs.collect();
+    pairs.sort_by_key(|&(a, b)| (Reverse(shared(a, b)), a, b));
+    pairs.truncate(OPTIONS.most_pairs);
+    let mut found: Vec<(usize, [usize; 3])> = Vec::new();
+    for (a, b) in pairs {
+        let weakest = |&c: &usize| shared(a, b).min(shared(a, c)).min(shared(b, c));
+        let third = (0..views).filter(|c| *c != a && *c != b).rev().max_by_key(weakest);
+        let Some(third) = third.filter(|c| is_enough(weakest(c))) else { continue };
+        let mut triplet = [a, b, third];
+        triplet.sort_unstable();
+        found.push((weakest(&third), triplet));
+    }
+    found.sort_by_key(|&(weakest, views)| (Reverse(weakest), views));
+    found.dedup();
+    diverse(found.into_iter().map(|(_, views)| views).collect(), OPTIONS.most_triplets)
 }
 
 /// The views in which anything is observed, if at least half of the tracks that are observed at all, and enough of
@@ -163,7 +209,7 @@ fn greedy_views(problem: &Problem, open: &[bool], least: usize) -> Vec<Vec<usize
     }
     found.sort_by(|a, b| b.0.cmp(&a.0).then_with(|| a.1.cmp(&b.1)));
     found.dedup();
-    diverse(found.into_iter().map(|(_, views)| views).collect())
+    diverse(found.into_iter().map(|(_, views)| views).collect(), OPTIONS.most_blocks)
 }
 
 /// At most `most` of the items, evenly spread.
@@ -172,17 +218,18 @@ pub fn evenly(items: &[usize], most: usize) -> Vec<usize> {
     (0..count).map(|k| items[k * items.len() / count]).collect()
 }
 
-/// At most [`ViewSelectionOptions::most_blocks`] of the ranked sets: those that share at most half of their views with
-/// every better one first, for a block that failed is not saved by changing one view.
-fn diverse(ranked: Vec<Vec<usize>>) -> Vec<Vec<usize>> {
+/// At most `most` of the ranked sets: those that share at most half of their views with every better one first, for one
+/// that failed is not saved by changing one view.
+fn diverse<Set: AsRef<[usize]>>(ranked: Vec<Set>, most: usize) -> Vec<Set> {
     let overlaps = |a: &[usize], b: &[usize]| 2 * a.iter().filter(|view| b.contains(view)).count() > a.len();
-    let (mut chosen, mut similar): (Vec<Vec<usize>>, Vec<Vec<usize>>) = (Vec::new(), Vec::new());
+    let (mut chosen, mut similar): (Vec<Set>, Vec<Set>) = (Vec::new(), Vec::new());
     for views in ranked {
-        let list = if chosen.iter().any(|better| overlaps(&views, better)) { &mut similar } else { &mut chosen };
+        let is_similar = chosen.iter().any(|better| overlaps(views.as_ref(), better.as_ref()));
+        let list = if is_similar { &mut similar } else { &mut chosen };
         list.push(views);
     }
     chosen.append(&mut similar);
-    chosen.truncate(OPTIONS.most_blocks);
+    chosen.truncate(most);
     chosen
 }
 

@@ -18,7 +18,7 @@ use super::problem::Problem;
 use super::recorder::Recorder;
 use super::sequence::ProjectiveReconstruction;
 use super::{Error, all_tracks, near_duplicates, scpsfm, second_structures, static_tracks, track_sampling};
-use crate::domain::{FocalPrior, Grade, Method, Stage, WarningCode};
+use crate::domain::{FocalPrior, Grade, Method, Proposal, Stage, WarningCode};
 use crate::geometry::bundle::metric::{Intrinsics, MetricReconstruction};
 use crate::geometry::statistics::median;
 
@@ -43,9 +43,10 @@ pub struct Effort {
 /// What became of one block.
 pub struct Attempt {
     pub block: Block,
-    /// What the search found, its consensus refined and over the tracks of the block; none when nothing stands.
+    /// What the search found, its consensus refined and over the tracks of the block; without one where nothing stands,
+    /// or where it was found by other tracks.
     pub found: Found,
-    /// The consensus as a reconstruction of its inliers, or what that was extended to; `None` when nothing stands.
+    /// The consensus as a reconstruction of its inliers, or what that was extended to; `None` where nothing stands.
     pub projective: Option<ProjectiveReconstruction>,
     /// Every track and observation judged by it, where that was done already.
     pub judged: Option<Judged>,
@@ -71,6 +72,14 @@ impl Attempt {
             weights_by_depths: None,
             decided: None,
         }
+    }
+
+    /// What was found of some of the views of a block by other tracks than its complete ones; `None`: nothing.
+    pub fn of_projective(block: Block, found: Option<ProjectiveReconstruction>) -> Self {
+        let mut attempt = Self::new(block);
+        attempt.found.winning_proposal = found.is_some().then_some(Proposal::Uniform);
+        attempt.projective = found.map(ProjectiveReconstruction::oriented);
+        attempt
     }
 
     /// Views that have a camera, increasing.
@@ -116,7 +125,7 @@ impl Attempt {
 
     /// Larger is better: solved before unsolved, then by grade, then by the certainty of the focal length.
     pub fn merit(&self) -> (u8, f64) {
-        let Some(calibration) = &self.calibration else { return (u8::from(self.found.consensus.is_some()), 0.0) };
+        let Some(calibration) = &self.calibration else { return (u8::from(self.projective.is_some()), 0.0) };
         let grade = match calibration.grade {
             Grade::Metric => WEAK_MERIT + 1,
             Grade::Weak => WEAK_MERIT,
@@ -240,11 +249,13 @@ pub fn calibrate(
     priors: &[Option<FocalPrior>],
     recorder: &mut Recorder,
 ) -> Result<(), Error> {
-    let (Some(consensus), Some(projective)) = (&attempt.found.consensus, &attempt.projective) else { return Ok(()) };
+    let Some(projective) = &attempt.projective else { return Ok(()) };
     recorder.enter(Stage::Calibrate);
-    attempt.calibration = Some(match attempt.found.verified_by {
-        VerifiedBy::ImagePoints => calibrate_projective(problem, projective, priors)?,
-        VerifiedBy::Depths { focal } => depths::calibrate(problem, &attempt.block.complete, consensus, focal),
+    attempt.calibration = Some(match (&attempt.found.verified_by, &attempt.found.consensus) {
+        (VerifiedBy::Depths { focal }, Some(consensus)) => {
+            depths::calibrate(problem, &attempt.block.complete, consensus, *focal)
+        }
+        _ => calibrate_projective(problem, projective, priors)?,
     });
     if let Some(intrinsics) = attempt.calibration.as_ref().and_then(Outcome::intrinsics) {
         recorder.hypothesis.focal_px = Some(intrinsics.focal * problem.scale_px);

@@ -24,6 +24,7 @@ mod projective;
 mod projective_growth;
 mod register;
 mod structure;
+mod triplets;
 mod windows;
 
 use std::ops::ControlFlow;
@@ -103,7 +104,11 @@ fn of_blocks(problem: &Problem, recorder: &mut Recorder) -> Result<Ended, Error>
         if blocks.is_whole { ExtensionOptions::DEFAULT.first_subsets.min(subsets.len()) } else { subsets.len() };
     let (cheap, rest) = subsets.split_at(cheap);
     // Nothing else is searched of a whole input with depths: what it has found stands.
-    let mut best = by_projective_extension(problem, first, !is_quick, cheap, recorder)?;
+    let mut best = by_projective_extension(problem, None, starts(first, !is_quick, cheap), recorder)?;
+    if !blocks.is_whole && metric.is_none() && !holds_most_views(problem, &best) {
+        let triplets = view_selection::triplets(problem).into_iter().map(Start::Triplet).collect();
+        best = by_projective_extension(problem, best, triplets, recorder)?;
+    }
     if is_quick && metric.is_none() && !stands(&best) {
         let first = match blocks.by_calibration(problem, false, recorder)? {
             ControlFlow::Break(ended) => return Ok(ended),
@@ -112,7 +117,7 @@ fn of_blocks(problem: &Problem, recorder: &mut Recorder) -> Result<Ended, Error>
             }
             ControlFlow::Continue(ended) => ended.seed(),
         };
-        best = by_projective_extension(problem, first, false, rest, recorder)?;
+        best = by_projective_extension(problem, None, starts(first, false, rest), recorder)?;
     }
     let best = best.filter(|best| metric.is_none() || best.is_trusted());
     Ok(match (best.map(|best| metric_of(problem, best, recorder)).transpose()?, metric) {
@@ -209,6 +214,11 @@ fn stands(attempt: &Option<Attempt>) -> bool {
     attempt.as_ref().is_some_and(|attempt| attempt.projective.is_some())
 }
 
+/// Whether there is a reconstruction of half of the views or more.
+fn holds_most_views(problem: &Problem, attempt: &Option<Attempt>) -> bool {
+    attempt.as_ref().is_some_and(|attempt| 2 * attempt.views().len() >= problem.observed_views().len())
+}
+
 /// The whole input as one block, with the views that its search left aside, and the tracks that depths did not verify.
 fn of_whole(problem: &Problem, views: &[usize], is_quick: bool, recorder: &mut Recorder) -> Result<Attempt, Error> {
     let effort = Effort { is_quick, is_seed: false };
@@ -266,29 +276,46 @@ fn by_calibrated_blocks(
     }
 }
 
-/// The best of an attempt and of those on these sets of views, each extended to all views without a calibration and,
-/// where it is not known yet, calibrated then; the first that is METRIC.
-///
-/// * `keeps_first`: whether the first attempt stands as it is where its extension leaves too little
+/// What a projective extension begins from.
+enum Start {
+    /// What was found already, and whether it stands as it is where its extension leaves too little.
+    Found(Box<Attempt>, bool),
+    /// The tracks that are complete over these views.
+    Block(Vec<usize>),
+    /// The tracks that two or three of these views share.
+    Triplet([usize; 3]),
+}
+
+/// What was found already, then these sets of views.
+fn starts(found: Option<Attempt>, keeps: bool, sets: &[Vec<usize>]) -> Vec<Start> {
+    let found = found.map(|attempt| Start::Found(Box::new(attempt), keeps));
+    found.into_iter().chain(sets.iter().cloned().map(Start::Block)).collect()
+}
+
+/// The best of one that stands and of these, each extended to all views without a calibration and, where it is not
+/// known yet, calibrated then; the first that is METRIC.
 fn by_projective_extension(
     problem: &Problem,
-    first: Option<Attempt>,
-    keeps_first: bool,
-    sets: &[Vec<usize>],
+    best: Option<Attempt>,
+    starts: Vec<Start>,
     recorder: &mut Recorder,
 ) -> Result<Option<Attempt>, Error> {
-    let mut best: Option<Attempt> = None;
-    let mut unsolved = None;
-    let mut first = first;
-    let starts = usize::from(first.is_some()) + sets.len();
-    for k in 0..starts {
+    let (mut best, mut unsolved) = if stands(&best) { (best, None) } else { (None, best) };
+    let mut pairs = triplets::Pairs::new(problem);
+    let count = starts.len();
+    for (k, start) in starts.into_iter().enumerate() {
         problem.stopped()?;
-        let (mut attempt, keeps) = match first.take() {
-            Some(attempt) => (attempt, keeps_first),
-            None => {
-                recorder.begin_block(k, starts);
-                let views = &sets[k - (starts - sets.len())];
-                (attempt::search_block(problem, problem.block(views), QUICK_SEED, recorder)?, false)
+        if !matches!(start, Start::Found(..)) {
+            recorder.begin_block(k, count);
+        }
+        let (mut attempt, keeps) = match start {
+            Start::Found(attempt, keeps) => (*attempt, keeps),
+            Start::Block(views) => {
+                (attempt::search_block(problem, problem.block(&views), QUICK_SEED, recorder)?, false)
+            }
+            Start::Triplet(views) => {
+                recorder.enter(Stage::Search);
+                (Attempt::of_projective(problem.block(&views), pairs.reconstruction(&views)), false)
             }
         };
         extend_projectively(problem, &mut attempt, keeps, recorder)?;

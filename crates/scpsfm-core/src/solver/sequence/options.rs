@@ -116,6 +116,22 @@ options! {
 }
 
 options! {
+    /// How three views that share tracks in pairs become a seed.
+    pub struct TripletOptions {
+        /// Noise of the matches, in units of what is assumed, which is rather too high: with few matches that tell right
+        /// from wrong only the narrower gates do.
+        noise_levels: [f64; 3] = [1.0, 0.3, 0.1],
+        /// Tracks of a pair at most, evenly spread: their fundamental matrix has seven unknowns.
+        most_tracks: usize = 300,
+        /// Iterations of the first adjustment of their cameras.
+        iterations: usize = 30,
+        /// Share of the tracks that agree with a fundamental matrix which must have a point by all three cameras. A
+        /// matrix of another body's motion, or of wrong matches, contradicts the other two.
+        least_share: f64 = 0.7,
+    }
+}
+
+options! {
     /// How further components are looked for.
     pub struct ComponentOptions {
         /// Blocks that are tried for components at most, and how many may fail one after the other.

@@ -94,13 +94,24 @@ impl<'a> Growing<'a> {
         self.support[track] >= VERIFIED
     }
 
-    /// The observations of a view whose points may support its camera: the verified ones, or, where these are too few,
-    /// those of two views too. Nothing verifies them, but views that are linked by few tracks have no others.
+    /// Whether too few verified points hold a view, so that those of two views count too. Nothing verifies these, but
+    /// views that are linked by few tracks have no others.
+    fn is_loose(&self, view: usize) -> bool {
+        let verified = self.problem.of_view[view].iter().filter(|&&k| {
+            let track = self.problem.track_of(k as usize);
+            self.is_verified(track)
+        });
+        verified.count() < self.options.least_agreeing
+    }
+
+    /// The observations of a view whose points may support its camera: the verified ones, or all of a loose view.
     fn points_for(&self, view: usize) -> impl Iterator<Item = usize> {
-        let verified = move |&k: &usize| self.is_verified(self.problem.track_of(k));
-        let of_view = move || self.problem.of_view[view].iter().map(|&k| k as usize);
-        let are_enough = of_view().filter(verified).count() >= self.options.least_agreeing;
-        of_view().filter(move |k| verified(k) || !are_enough && self.points[self.problem.track_of(*k)].is_some())
+        let is_loose = self.is_loose(view);
+        let supports = move |&k: &usize| {
+            let track = self.problem.track_of(k);
+            self.is_verified(track) || is_loose && self.points[track].is_some()
+        };
+        self.problem.of_view[view].iter().map(|&k| k as usize).filter(supports)
     }
 
     /// Triangulates every track anew, or those that a view sees.
@@ -138,15 +149,29 @@ impl<'a> Growing<'a> {
         (agreeing as f64 >= problem.least_share * seen.len() as f64).then_some((found, seen))
     }
 
-    /// What is kept: the verified points of the longest tracks until every view has `of_view` observations.
-    fn reconstruction(&self, of_view: usize) -> ProjectiveReconstruction {
+    /// The verified points.
+    fn verified(&self) -> Vec<usize> {
+        (0..self.points.len()).filter(|&track| self.is_verified(track)).collect()
+    }
+
+    /// The verified points, and all of loose views.
+    fn holding(&self) -> Vec<usize> {
+        let is_loose: Vec<bool> = (0..self.cameras.len()).map(|view| self.is_loose(view)).collect();
+        let holds = |&track: &usize| {
+            let mut seen = self.problem.of_track(track).filter(|&k| self.kept[k]);
+            self.is_verified(track) || seen.any(|k| is_loose[self.problem.view_of(k)])
+        };
+        (0..self.points.len()).filter(holds).collect()
+    }
+
+    /// What is kept of these points: those of the longest tracks until every view has `of_view` observations.
+    fn reconstruction(&self, tracks: Vec<usize>, of_view: usize) -> ProjectiveReconstruction {
         let problem = self.problem;
         let views = self.views();
         let mut place = vec![usize::MAX; self.cameras.len()];
         views.iter().enumerate().for_each(|(new, &view)| place[view] = new);
-        let verified = (0..self.points.len()).filter(|&track| self.is_verified(track)).collect();
         let wanted = vec![of_view; self.cameras.len()];
-        let tracks = growth::covering(problem, verified, |track| self.support[track], &self.kept, &wanted);
+        let tracks = growth::covering(problem, tracks, |track| self.support[track], &self.kept, &wanted);
         let observations = tracks.iter().enumerate().flat_map(|(point, &track)| {
             let kept = problem.of_track(track).filter(|&k| self.kept[k]);
             kept.map(|k| Observation { view: place[problem.view_of(k)], point, ..problem.pinhole_observation(k) })
@@ -165,7 +190,7 @@ impl<'a> Growing<'a> {
 
     /// Adjusts all registered views with the points that hold them best, and estimates the noise from what remains.
     fn adjust(&mut self, iterations: usize, recorder: &mut Recorder) {
-        let mut reconstruction = self.reconstruction(self.options.of_view);
+        let mut reconstruction = self.reconstruction(self.holding(), self.options.of_view);
         if reconstruction.observations.is_empty() {
             return;
         }
@@ -216,7 +241,7 @@ impl<'a> Growing<'a> {
     }
 
     fn finish(self) -> ProjectiveReconstruction {
-        self.reconstruction(usize::MAX)
+        self.reconstruction(self.verified(), usize::MAX)
     }
 }
 

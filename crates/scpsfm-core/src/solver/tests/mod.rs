@@ -8,6 +8,7 @@ mod observations;
 mod scpsfm;
 mod sequences;
 mod special_scenes;
+mod triplets;
 
 use super::*;
 use crate::domain::{

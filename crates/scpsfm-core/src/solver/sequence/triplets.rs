@@ -1,0 +1,171 @@
+//! Seeds of inputs whose views share tracks in pairs, but no three of them enough: three views, by the fundamental
+//! matrices of their pairs.
+
+use std::collections::BTreeMap;
+
+use nalgebra::Vector2;
+use rand::SeedableRng;
+use rand_chacha::ChaCha8Rng;
+
+use super::options::{GrowthOptions, TripletOptions};
+use super::projective::ProjectiveReconstruction;
+use crate::geometry::bundle;
+use crate::geometry::fundamental::{self, Fundamental, Match};
+use crate::geometry::observation::Observation;
+use crate::geometry::robust_triangulation::Triangulator;
+use crate::geometry::statistics::ln_choose;
+use crate::geometry::three_views::{self, FundamentalMatrices};
+use crate::geometry::{Camera, triangulation};
+use crate::solver::a_contrario::FalseAlarmOptions;
+use crate::solver::problem::Problem;
+use crate::solver::view_selection::evenly;
+
+const OPTIONS: TripletOptions = TripletOptions::DEFAULT;
+
+/// The epipolar geometry of pairs of views, each looked for once.
+pub struct Pairs<'a> {
+    problem: &'a Problem<'a>,
+    known: BTreeMap<(usize, usize), Option<Pair>>,
+}
+
+/// The epipolar geometry of two views.
+#[derive(Clone)]
+struct Pair {
+    fundamental: Fundamental,
+    /// Tracks that agree with it, increasing.
+    tracks: Vec<usize>,
+    /// Natural logarithm of the number of such pairs to be expected in data without structure.
+    ln_false_alarms: f64,
+}
+
+impl<'a> Pairs<'a> {
+    pub fn new(problem: &'a Problem<'a>) -> Self {
+        Self { problem, known: BTreeMap::new() }
+    }
+
+    /// The reconstruction of three views by the tracks that two or three of them see; `None` where the pairs have no
+    /// epipolar geometry that more tracks agree with than by chance, or no three cameras agree with all of them.
+    ///
+    /// * `views`: increasing
+    pub fn reconstruction(&mut self, views: &[usize; 3]) -> Option<ProjectiveReconstruction> {
+        let [first, second, third] = *views;
+        let first_to_second = self.pair(first, second)?;
+        let first_to_third = self.pair(first, third)?;
+        let second_to_third = self.pair(second, third)?;
+        let pairs = [&first_to_second, &first_to_third, &second_to_third];
+        let ln_false_alarms: f64 = pairs.iter().map(|pair| pair.ln_false_alarms).sum();
+        if ln_false_alarms >= FalseAlarmOptions::DEFAULT.ln_acceptable {
+            return None;
+        }
+        let agrees = |track: &usize| pairs.iter().all(|pair| pair.tracks.binary_search(track).is_ok());
+        let common: Vec<[Vector2<f64>; 3]> = first_to_second
+            .tracks
+            .iter()
+            .filter(|track| agrees(track))
+            .filter_map(|&track| {
+                let [a, b, c] = views.map(|view| seen_by(self.problem, track, view));
+                Some([a?.xy, b?.xy, c?.xy])
+            })
+            .collect();
+        let matrices = FundamentalMatrices {
+            first_to_second: &first_to_second.fundamental,
+            first_to_third: &first_to_third.fundamental,
+            second_to_third: &second_to_third.fundamental,
+        };
+        let cameras = three_views::cameras(&matrices, &common)?;
+        let mut tracks: Vec<usize> = pairs.iter().flat_map(|pair| pair.tracks.iter().copied()).collect();
+        tracks.sort_unstable();
+        tracks.dedup();
+        let adjusted = self.adjusted(views, cameras.to_vec(), tracks);
+        let tried = adjusted.tracks.len() as f64;
+        let found = self.agreeing(adjusted);
+        (found.tracks.len() as f64 >= OPTIONS.least_share * tried).then_some(found)
+    }
+
+    /// The cameras adjusted to these tracks. What is linear in matrices of a dozen matches each is too far off to be gated
+    /// at their noise.
+    fn adjusted(&self, views: &[usize; 3], mut cameras: Vec<Camera>, tracks: Vec<usize>) -> ProjectiveReconstruction {
+        let problem = self.problem;
+        let (mut points, mut observations) = (Vec::new(), Vec::new());
+        for (point, &track) in tracks.iter().enumerate() {
+            let seen = |view: usize| Some(Observation { view, point, ..seen_by(problem, track, views[view])? });
+            let seen: Vec<Observation> = (0..views.len()).filter_map(seen).collect();
+            points.push(triangulation::linear(&cameras, &seen));
+            observations.extend(seen);
+        }
+        let noise = problem.initial_noise;
+        let options = GrowthOptions::PROJECTIVE.adjustment(OPTIONS.iterations, noise);
+        bundle::projective::adjust(&mut cameras, &mut points, &observations, &options, problem.stop);
+        let (views, tried) = (views.to_vec(), tracks.len());
+        ProjectiveReconstruction { views, cameras, tracks, points, observations, noise, tried }.oriented()
+    }
+
+    /// The points that the cameras agree on, with the observations that they agree by.
+    fn agreeing(&self, adjusted: ProjectiveReconstruction) -> ProjectiveReconstruction {
+        let gate = self.problem.gate(adjusted.noise);
+        let triangulator = Triangulator::new(&adjusted.cameras);
+        let (mut tracks, mut points, mut observations) = (Vec::new(), Vec::new(), Vec::new());
+        for seen in adjusted.observations.chunk_by(|a, b| a.point == b.point) {
+            let Some(found) = triangulator.robust(seen, gate) else { continue };
+            let agreeing = seen.iter().zip(&found.agrees).filter(|(_, agrees)| **agrees);
+            observations.extend(agreeing.map(|(seen, _)| Observation { point: points.len(), ..*seen }));
+            tracks.push(adjusted.tracks[seen[0].point]);
+            points.push(found.point);
+        }
+        ProjectiveReconstruction { tracks, points, observations, ..adjusted }
+    }
+
+    /// * `from`, `to`: increasing
+    fn pair(&mut self, from: usize, to: usize) -> Option<Pair> {
+        let problem = self.problem;
+        self.known.entry((from, to)).or_insert_with(|| pair(problem, from, to)).clone()
+    }
+}
+
+/// The epipolar geometry of two views that most tracks agree with for the noise, where that is no chance.
+fn pair(problem: &Problem, from: usize, to: usize) -> Option<Pair> {
+    let tracks: Vec<usize> = problem.of_view[from].iter().map(|&k| problem.track_of(k as usize)).collect();
+    let shared = |track: &usize| problem.supports_growth(*track, false) && seen_by(problem, *track, to).is_some();
+    let tracks: Vec<usize> = tracks.into_iter().filter(shared).collect();
+    let tracks = evenly(&tracks, OPTIONS.most_tracks);
+    let seen = |&track: &usize| {
+        let [from, to] = [from, to].map(|view| seen_by(problem, track, view));
+        Some(Match { from: from?.xy, to: to?.xy })
+    };
+    let matches: Vec<Match> = tracks.iter().filter_map(seen).collect();
+    let of_noise = |level: &f64| {
+        let noise = level * problem.initial_noise;
+        let mut rng = ChaCha8Rng::seed_from_u64(problem.settings.seed);
+        rng.set_stream((from * problem.views() + to) as u64);
+        let found = fundamental::robust(&matches, noise, &mut rng, problem.stop)?;
+        let ln_false_alarms = ln_false_alarms(matches.len(), found.inlier_count(), noise, problem.outlier_density);
+        let agreeing = tracks.iter().zip(&found.inlier).filter(|(_, inlier)| **inlier).map(|(track, _)| *track);
+        Some(Pair { fundamental: found.model, tracks: agreeing.collect(), ln_false_alarms })
+    };
+    let found = OPTIONS.noise_levels.iter().filter_map(of_noise);
+    let best = found.min_by(|a, b| a.ln_false_alarms.total_cmp(&b.ln_false_alarms));
+    best.filter(|best| best.ln_false_alarms < 0.0)
+}
+
+/// Natural logarithm of the number of such fundamental matrices to be expected among matches without structure:
+/// a-contrario as by Moisan & Stival (2004, section 3), `C(m, k) C(k, 8) a^(k - 8)` at each noise, where `a` is the
+/// probability that a point anywhere in the image is as near its epipolar line.
+fn ln_false_alarms(matches: usize, inliers: usize, noise: f64, outlier_density: f64) -> f64 {
+    let determine = fundamental::LEAST_MATCHES;
+    if inliers <= determine {
+        return f64::INFINITY;
+    }
+    // The distance of either point from its line is √2 Sampson distances, to both sides.
+    let width = 2.0 * (2.0 * fundamental::squared_gate(noise)).sqrt();
+    let ln_by_chance = (width * outlier_density).min(1.0).ln();
+    let levels = OPTIONS.noise_levels.len() as f64;
+    levels.ln()
+        + ln_choose(matches, inliers)
+        + ln_choose(inliers, determine)
+        + (inliers - determine) as f64 * ln_by_chance
+}
+
+/// The observation of a track in a view, where a pinhole would have made it.
+fn seen_by(problem: &Problem, track: usize, view: usize) -> Option<Observation> {
+    problem.of_track(track).find(|&k| problem.view_of(k) == view).map(|k| problem.pinhole_observation(k))
+}

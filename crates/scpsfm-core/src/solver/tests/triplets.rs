@@ -1,0 +1,79 @@
+//! Inputs whose views share tracks in pairs, but no three of them enough.
+
+use rand::SeedableRng;
+use std::collections::BTreeMap;
+
+use rand::seq::index;
+use rand_chacha::ChaCha8Rng;
+
+use super::*;
+use crate::solver::view_selection;
+
+const VIEWS: usize = 20;
+const TRACKS: usize = 1_000;
+
+/// A scene of which each track keeps four views, anywhere among them: pairs of views share some thirty tracks, no three
+/// more than seven.
+///
+/// * `outliers`: share of wrong tracks
+fn scattered(seed: u64, outliers: f64) -> (Input, Scene) {
+    let options =
+        SceneOptions { views: VIEWS, tracks: TRACKS, outliers, noise: 0.0005, seed, ..SceneOptions::default() };
+    let scene = Scene::generate(&options).expect("valid options");
+    let mut rng = ChaCha8Rng::seed_from_u64(seed);
+    let mut shared = BTreeMap::new();
+    let triples = |views: &[usize]| -> Vec<Vec<usize>> {
+        (0..views.len()).map(|left_out| [&views[..left_out], &views[left_out + 1..]].concat()).collect()
+    };
+    let mut kept_views = || loop {
+        let mut views = index::sample(&mut rng, VIEWS, 4).into_vec();
+        views.sort_unstable();
+        if triples(&views).iter().all(|triple| shared.get(triple).is_none_or(|count| *count < 7)) {
+            triples(&views).into_iter().for_each(|triple| *shared.entry(triple).or_insert(0) += 1);
+            return views;
+        }
+    };
+    let kept: Vec<Vec<usize>> = (0..TRACKS).map(|_| kept_views()).collect();
+    let from = &scene.input;
+    let mut raw = RawInput { views: from.views.clone(), track_count: TRACKS, ..RawInput::default() };
+    for k in 0..from.x.len() {
+        let (view, track) = (from.view[k], from.track[k]);
+        if kept[track as usize].contains(&(view as usize)) {
+            raw.view.push(view);
+            raw.track.push(track);
+            raw.x.push(from.x[k]);
+            raw.y.push(from.y[k]);
+        }
+    }
+    let input = Input::new(raw, &Limits::default(), "scattered").expect("valid input");
+    let (settings, stop) = (SolveSettings::default(), StopToken::default());
+    let problem = Problem::new(&input, &settings, Threads::ONE, &stop);
+    assert!(view_selection::blocks(&problem).is_empty(), "seed {seed}: three views share enough tracks");
+    drop(problem);
+    (input, scene)
+}
+
+/// Two tracks in ten are wrong.
+#[test]
+fn views_that_share_tracks_in_pairs_alone_are_reconstructed() {
+    for seed in 0..3 {
+        let (input, scene) = scattered(seed, 0.2);
+        let solution = solved(&input, &SolveSettings { seed, ..SolveSettings::default() });
+        let f1 = agreement(&solution.tracks.inlier, &scene.truth.inlier).f1;
+        println!("seed {seed}: {:?}, F1 {f1}, {:?}", solution.grade, solution.warnings);
+        assert_eq!(solution.grade, Some(Grade::Metric), "seed {seed}: {:?}", solution.warnings);
+        assert_eq!(solution.registered_views().len(), VIEWS, "seed {seed}");
+        assert!(f1 > 0.95, "seed {seed}: F1 {f1}");
+        assert!(focal_error(&solution, &scene) < 0.02, "seed {seed}: {}", focal_error(&solution, &scene));
+    }
+}
+
+/// Pairs of views agree with some fundamental matrix by chance, and no three with three cameras.
+#[test]
+fn pairs_of_views_without_structure_are_no_reconstruction() {
+    for seed in 0..5 {
+        let (input, _) = scattered(seed, 1.0);
+        let solution = solved(&input, &SolveSettings { seed, ..SolveSettings::default() });
+        assert_eq!(solution.status, Status::NoReconstruction, "seed {seed}: {:?}", solution.warnings);
+    }
+}
