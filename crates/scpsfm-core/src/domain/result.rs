@@ -320,7 +320,7 @@ pub struct Solution {
     /// `None` without a reconstruction.
     pub grade: Option<Grade>,
     pub method: Method,
-    /// Proposal whose sample led to the accepted consensus; `None` where nothing was accepted or nothing was sampled.
+    /// Proposal whose sample led to the accepted consensus; `None` where nothing was accepted, or was found otherwise.
     pub winning_proposal: Option<Proposal>,
     /// Network iterations spent.
     pub iterations: u32,

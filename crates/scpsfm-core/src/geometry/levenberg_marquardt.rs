@@ -17,6 +17,8 @@ const GROWTH_UP: f64 = 2.0;
 /// Bounds of the factor after an accepted one: a step that gains what was predicted divides the damping by five, one
 /// that gains next to nothing doubles it.
 const ACCEPTED_FACTORS: (f64, f64) = (0.2, 2.0);
+/// Accepted steps over which the pace of a descent is measured: as many as rank the starts of a calibration.
+const PACE_STEPS: usize = 12;
 /// Least damping of dense problems: below it, rounding in the gauge directions would be amplified into the step.
 pub(crate) const MIN_DAMPING: f64 = 1e-10;
 
@@ -62,6 +64,9 @@ pub(crate) struct Options {
     pub initial_damping: f64,
     /// Least damping, see [`MIN_DAMPING`].
     pub min_damping: f64,
+    /// Ends as hopeless where the steps that are left, at the pace of the last [`PACE_STEPS`], do not bring the cost
+    /// below this; infinite: never.
+    pub hopeless_above: f64,
 }
 
 /// What the loop did.
@@ -72,6 +77,15 @@ pub struct Report {
     pub cost: f64,
     /// Accepted steps.
     pub iterations: usize,
+    /// Whether it ended as hopeless, see [`Options::hopeless_above`].
+    pub is_hopeless: bool,
+}
+
+impl Report {
+    /// Report of a run without steps.
+    pub(crate) fn at(cost: f64) -> Self {
+        Self { initial_cost: cost, cost, iterations: 0, is_hopeless: false }
+    }
 }
 
 /// Minimises the cost from `state`, which is replaced by the best one found.
@@ -83,8 +97,8 @@ pub(crate) fn minimise<P: LeastSquares>(
     options: &Options,
     stop: &StopToken,
 ) -> Report {
-    let initial_cost = problem.cost(state);
-    let mut report = Report { initial_cost, cost: initial_cost, iterations: 0 };
+    let mut report = Report::at(problem.cost(state));
+    let mut costs = vec![report.cost];
     let mut trial = state.clone();
     let mut damping = options.initial_damping.max(options.min_damping);
     while report.iterations < options.max_iterations && report.cost > 0.0 && !stop.is_stopped() {
@@ -106,11 +120,26 @@ pub(crate) fn minimise<P: LeastSquares>(
         damping = (damping * factor_after(gain / predicted)).max(options.min_damping);
         report.cost = cost;
         report.iterations += 1;
+        costs.push(cost);
         if gain < options.relative_tolerance * cost {
+            break;
+        }
+        if is_hopeless(&costs, options) {
+            report.is_hopeless = true;
             break;
         }
     }
     report
+}
+
+/// See [`Options::hopeless_above`].
+///
+/// * `costs`: at the start and after every step
+fn is_hopeless(costs: &[f64], options: &Options) -> bool {
+    let Some(first) = costs.len().checked_sub(PACE_STEPS + 1) else { return false };
+    let (before, cost) = (costs[first], costs[costs.len() - 1]);
+    let left = (options.max_iterations + 1 - costs.len()) as f64 / PACE_STEPS as f64;
+    cost * (cost / before).powf(left) > options.hopeless_above
 }
 
 /// Nielsen's factor on the damping after a step that gained this share of what was predicted; the least where that is
@@ -196,8 +225,13 @@ mod tests {
         }
     }
 
-    const OPTIONS: Options =
-        Options { max_iterations: 100, relative_tolerance: 1e-12, initial_damping: 1e-3, min_damping: MIN_DAMPING };
+    const OPTIONS: Options = Options {
+        max_iterations: 100,
+        relative_tolerance: 1e-12,
+        initial_damping: 1e-3,
+        min_damping: MIN_DAMPING,
+        hopeless_above: f64::INFINITY,
+    };
 
     #[test]
     fn the_minimum_of_a_curved_valley_is_found() {
@@ -205,6 +239,47 @@ mod tests {
         let report = minimise(&mut Valley(Normal::zeros()), &mut state, &OPTIONS, &StopToken::default());
         assert!((state - Vector2::new(1.0, 1.0)).norm() < 1e-6, "{state} {report:?}");
         assert!(report.iterations < 40 && report.cost < report.initial_cost, "{report:?}");
+    }
+
+    /// Steps of which each takes a tenth of the cost: .9³⁰ of it is left after 30.
+    #[test]
+    fn a_descent_ends_where_its_pace_leads_nowhere() {
+        let costs: Vec<f64> = (0..=PACE_STEPS as i32).map(|step| 0.9f64.powi(step)).collect();
+        let ends = |costs: &[f64], hopeless_above: f64| {
+            is_hopeless(costs, &Options { max_iterations: 30, hopeless_above, ..OPTIONS })
+        };
+        let last = 0.9f64.powi(30);
+        assert!(ends(&costs, 0.99 * last) && !ends(&costs, 1.01 * last));
+        assert!(!ends(&costs, f64::INFINITY) && !ends(&costs[1..], 0.0), "too few steps to tell");
+        let mut state = Vector2::new(-1.2, 1.0);
+        let options = Options { hopeless_above: 1e-3, ..OPTIONS };
+        let report = minimise(&mut Valley(Normal::zeros()), &mut state, &options, &StopToken::default());
+        assert!(!report.is_hopeless && report.cost < 1e-12, "{report:?}");
+        // A thousandth of every step leads nowhere.
+        let mut state = Vector2::new(-1.2, 1.0);
+        let report = minimise(&mut Slow(Valley(Normal::zeros())), &mut state, &options, &StopToken::default());
+        assert!(report.is_hopeless && report.iterations < 30, "{report:?}");
+    }
+
+    /// A thousandth of every step.
+    struct Slow(Valley);
+
+    impl LeastSquares for Slow {
+        type State = Vector2<f64>;
+
+        fn cost(&self, at: &Vector2<f64>) -> f64 {
+            self.0.cost(at)
+        }
+
+        fn linearise(&mut self, at: &Vector2<f64>) {
+            self.0.linearise(at);
+        }
+
+        fn step(&mut self, from: &Vector2<f64>, damping: f64, to: &mut Vector2<f64>) -> Option<f64> {
+            let predicted = self.0.step(from, damping, to)?;
+            *to = from + (*to - from) * 1e-3;
+            Some(predicted)
+        }
     }
 
     #[test]

@@ -26,6 +26,7 @@ const OPTIONS: levenberg_marquardt::Options = levenberg_marquardt::Options {
     relative_tolerance: 1e-6,
     initial_damping: 1e-3,
     min_damping: MIN_DAMPING,
+    hopeless_above: f64::INFINITY,
 };
 /// Log focal lengths and normals that are nearer than this are the same start: adjustment takes them to one minimum.
 const SAME: f64 = 0.05;

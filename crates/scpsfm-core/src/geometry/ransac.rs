@@ -64,6 +64,7 @@ const REFINEMENT: levenberg_marquardt::Options = levenberg_marquardt::Options {
     relative_tolerance: 1e-6,
     initial_damping: 1e-4,
     min_damping: levenberg_marquardt::MIN_DAMPING,
+    hopeless_above: f64::INFINITY,
 };
 /// Gates beyond which a datum weighs nothing in a refinement: a hundredth of its weight is left there.
 const WEIGHED_GATES: f64 = 9.0;

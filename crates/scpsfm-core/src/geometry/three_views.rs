@@ -7,15 +7,15 @@ use super::null_vector::{projection_equations, smallest_eigenvector};
 use super::observation::Observation;
 use super::{Camera, triangulation};
 
-/// Fundamental matrices of the pairs of three views, each from the earlier view to the later one.
+/// Fundamental matrices of the pairs of three views.
 pub struct FundamentalMatrices<'a> {
     pub first_to_second: &'a Fundamental,
     pub first_to_third: &'a Fundamental,
     pub second_to_third: &'a Fundamental,
 }
 
-/// Cameras whose pairs have these fundamental matrices, up to a projective transform; of matrices that contradict each
-/// other, as nearly as a linear solution has it.
+/// Cameras whose pairs have these fundamental matrices, up to a projective transform. Where the matrices contradict
+/// each other, the third camera is that of least algebraic error.
 ///
 /// The first two cameras are those of their own matrix. The third one, `P`, is linear in the rest: `Pᵀ F Q` is
 /// skew-symmetric where `F` is the matrix from the view of the camera `Q` (result 9.12), and it images the points that
@@ -23,11 +23,11 @@ pub struct FundamentalMatrices<'a> {
 ///
 /// * `common`: image points of tracks that all three views see
 ///
-/// Returns `None` where nothing finite comes of them.
+/// Returns `None` where the equations hold what is no finite number.
 ///
 /// # Pitfall
-/// Where the three centres are on a line, the matrices leave four unknowns of the third camera open: fewer than two
-/// common points do not determine it.
+/// Where the three centres are on a line, the matrices leave four unknowns of the third camera open, and a common point
+/// determines one of them: with fewer than four of these the camera is one of many.
 pub fn cameras(matrices: &FundamentalMatrices, common: &[[Vector2<f64>; 3]]) -> Option<[Camera; 3]> {
     let [first, second] = matrices.first_to_second.cameras();
     let mut normal = SMatrix::<f64, 12, 12>::zeros();
@@ -47,7 +47,9 @@ pub fn cameras(matrices: &FundamentalMatrices, common: &[[Vector2<f64>; 3]]) -> 
     }
     for [in_first, in_second, in_third] in common {
         let seen = [Observation::new(0, 0, *in_first), Observation::new(1, 0, *in_second)];
-        let point = triangulation::linear(&[first, second], &seen).try_normalize(f64::MIN_POSITIVE)?;
+        let Some(point) = triangulation::linear(&[first, second], &seen).try_normalize(f64::MIN_POSITIVE) else {
+            continue;
+        };
         for equation in projection_equations::<4, 12>(&point, in_third) {
             normal += equation * equation.transpose();
         }
@@ -65,7 +67,7 @@ mod tests {
     use rand::SeedableRng;
     use rand_chacha::ChaCha8Rng;
 
-    /// Cameras from pairs of views that share no track but one or none, in the frame of nothing but their own.
+    /// Every point but one is seen by two views only.
     #[test]
     fn three_cameras_come_of_the_matrices_of_their_pairs() {
         for seed in 0..5 {
@@ -73,7 +75,6 @@ mod tests {
             let of = |view: usize, point: usize| {
                 scene.observations.iter().find(|seen| (seen.view, seen.point) == (view, point)).expect("seen").xy
             };
-            // Every point is seen by two views, the last by all.
             let matrix = |from: usize, to: usize, third: usize| {
                 let matches: Vec<Match> = (0..59)
                     .filter(|point| point % 3 == third)

@@ -12,7 +12,7 @@ use super::problem::{Problem, camera_groups};
 use super::reconstruction::{Reconstruction, own_verdicts};
 use super::recorder::Recorder;
 use super::sequence::Ended;
-use super::view_selection::LEAST_VIEWS;
+use super::view_selection::{LEAST_SHARED_BY_PAIR, LEAST_VIEWS};
 use super::{second_structures, static_tracks};
 use crate::domain::result::{ObservationResults, Sigmas, TrackResults, TrackSplit, ViewResult};
 use crate::domain::{Calibration, Grade, Solution, Stage, Status, Warning, WarningCode};
@@ -270,8 +270,9 @@ fn why_unsolved(problem: &Problem, best: Option<&Attempt>) -> Warning {
         None => Warning::new(
             WarningCode::FewInliers,
             format!(
-                "no {LEAST_VIEWS} views share enough tracks: at least {LEAST_INLIERS}, no two of them equal, must be \
-                 seen in all of them, or more in every two of them",
+                "no {LEAST_VIEWS} views share enough tracks, at least {LEAST_INLIERS} of which no two are equal, and \
+                 no {LEAST_VIEWS} of which every two share at least {LEAST_SHARED_BY_PAIR} hold together more than by \
+                 chance",
             ),
         ),
         // All 0: too little is observed for a head to run.

@@ -129,7 +129,7 @@ impl<'a> Problem<'a> {
             true => near_duplicates::representatives(&ranges, |k| input.view_of(k), &xy, initial_noise, stop),
             false => (0..input.track_count()).collect(),
         };
-        // Where many tracks are copies of one, their spread is that of the copies.
+        // Many near-duplicates of one track would make the spread of the points that of these.
         let is_distinct = |k: &u32| {
             let track = input.track_of(*k as usize);
             representative[track] == track
@@ -346,6 +346,7 @@ fn focal_prior<'a>(views: impl Iterator<Item = &'a View>) -> Option<FocalPrior> 
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::domain::{Limits, RawInput};
 
     fn prior(views: &[Option<(f64, f64)>]) -> Option<FocalPrior> {
         let view = |prior: &Option<(f64, f64)>| View {
@@ -354,6 +355,28 @@ mod tests {
         };
         let views: Vec<View> = views.iter().map(view).collect();
         focal_prior(views.iter())
+    }
+
+    /// Tracks all over the images, and as many again within a pixel of the first.
+    #[test]
+    fn near_duplicates_do_not_make_the_points_look_close_together() {
+        let density = |duplicates: usize| {
+            let mut raw =
+                RawInput { views: vec![View::default(); 4], track_count: 60 + duplicates, ..Default::default() };
+            for track in 0..60 + duplicates {
+                let of = if track < 60 { track } else { 0 };
+                for view in 0..4 {
+                    raw.view.push(view as u32);
+                    raw.track.push(track as u32);
+                    raw.x.push((of * 617 % 1000 + 7 * view) as f64 + track as f64 / 120.0);
+                    raw.y.push((of * 391 % 1000 + 5 * view) as f64);
+                }
+            }
+            let input = Input::new(raw, &Limits::default(), "test").expect("valid");
+            Problem::new(&input, &SolveSettings::default(), Threads::ONE, &StopToken::default()).outlier_density
+        };
+        let (alone, among) = (density(0), density(60));
+        assert!((among / alone - 1.0).abs() < 0.05, "{among} for {alone}");
     }
 
     #[test]

@@ -1,5 +1,5 @@
 //! Which views are searched together: all of them where their tracks are complete, blocks of views that share many
-//! tracks, and small subsets of either.
+//! tracks, small subsets of either, and triplets whose views share tracks in pairs.
 
 use std::cmp::Reverse;
 
@@ -8,8 +8,20 @@ use super::problem::{Problem, observed_views};
 use crate::domain::Input;
 use crate::geometry::fundamental;
 
+/// Tracks that every two views of a triplet share: one more than determine their fundamental matrix.
+pub const LEAST_SHARED_BY_PAIR: usize = fundamental::LEAST_MATCHES + 1;
+
 /// Views below which a projective reconstruction carries no calibration worth searching for.
 pub const LEAST_VIEWS: usize = 3;
+
+/// Views that a reconstruction begins with.
+#[derive(Debug, Clone)]
+pub enum SeedViews {
+    /// By the tracks that are complete over them.
+    Block(Vec<usize>),
+    /// By the tracks that two or three of them share.
+    Triplet([usize; 3]),
+}
 
 options! {
     /// Which sets of views are worth solving.
@@ -28,10 +40,10 @@ options! {
         most_first_views: usize = 64,
         /// Blocks that are tried, best first, before the best result stands.
         most_blocks: usize = 4,
-        /// Pairs of views, those with most tracks in common, that triplets are made of, and triplets that are tried. A
-        /// tenth of a second each.
-        most_pairs: usize = 200,
-        most_triplets: usize = 12,
+        /// Second views of a triplet that are tried with each first: those that share most tracks with it.
+        most_second_views: usize = 8,
+        /// Triplets that are tried: as many as subsets.
+        most_triplets: usize = 8,
         /// Views of a subset. Of a track with three wrong observations of ten, four views are clean one time in six.
         subset_views: usize = 4,
         /// Subsets of one set, and of all sets together.
@@ -119,43 +131,48 @@ pub fn subsets(sets: &[Vec<usize>]) -> Vec<Vec<usize>> {
     found
 }
 
-/// Three views of which every two share tracks, best first: where the two with fewest share most. The tracks of either
-/// pair need not be those of another.
+/// Triplets of views of which every two share tracks, ranked by the number of tracks of the pair that shares fewest.
+/// The tracks of one pair need not be those of another.
 ///
-/// * At least one more than determine a fundamental matrix.
-pub fn triplets(problem: &Problem) -> Vec<[usize; 3]> {
-    let views = problem.views();
-    let mut shared = vec![0u32; views * views];
-    for track in (0..problem.tracks()).filter(|&track| problem.supports_growth(track, false)) {
+/// * `open`: which views may take part
+pub fn triplets(problem: &Problem, open: &[bool]) -> Vec<[usize; 3]> {
+    let seeing: Vec<usize> =
+        (0..problem.views()).filter(|&view| open[view] && !problem.of_view[view].is_empty()).collect();
+    let is_enough = |count: usize| count >= LEAST_SHARED_BY_PAIR;
+    let mut found: Vec<(usize, [usize; 3])> = Vec::new();
+    for first in evenly(&seeing, OPTIONS.most_first_views) {
         if problem.stop.is_stopped() {
             break;
         }
-        let seen: Vec<usize> = problem.of_track(track).map(|k| problem.view_of(k)).collect();
-        for (k, a) in seen.iter().enumerate() {
-            seen[..k].iter().for_each(|b| {
-                shared[a * views + b] += 1;
-                shared[b * views + a] += 1;
-            });
+        let with_first = shared_tracks(problem, open, first);
+        let mut others: Vec<usize> = seeing.iter().copied().filter(|&view| is_enough(with_first[view])).collect();
+        others.sort_by_key(|&view| (Reverse(with_first[view]), view));
+        for &second in others.iter().take(OPTIONS.most_second_views).take_while(|_| !problem.stop.is_stopped()) {
+            let with_second = shared_tracks(problem, open, second);
+            let weakest = |third: &usize| with_first[second].min(with_first[*third]).min(with_second[*third]);
+            // The first of equals, so that one input has one answer.
+            let third = others.iter().copied().filter(|third| *third != second).rev().max_by_key(weakest);
+            let Some(third) = third.filter(|third| is_enough(weakest(third))) else { continue };
+            let mut views = [first, second, third];
+            views.sort_unstable();
+            found.push((weakest(&third), views));
         }
-    }
-    let shared = |a: usize, b: usize| shared[a * views + b] as usize;
-    let is_enough = |count: usize| count > fundamental::LEAST_MATCHES;
-    let pairs = (0..views).flat_map(|b| (0..b).map(move |a| (a, b))).filter(|&(a, b)| is_enough(shared(a, b)));
-    let mut pairs: Vec<(usize, usize)> = pairs.collect();
-    pairs.sort_by_key(|&(a, b)| (Reverse(shared(a, b)), a, b));
-    pairs.truncate(OPTIONS.most_pairs);
-    let mut found: Vec<(usize, [usize; 3])> = Vec::new();
-    for (a, b) in pairs {
-        let weakest = |&c: &usize| shared(a, b).min(shared(a, c)).min(shared(b, c));
-        let third = (0..views).filter(|c| *c != a && *c != b).rev().max_by_key(weakest);
-        let Some(third) = third.filter(|c| is_enough(weakest(c))) else { continue };
-        let mut triplet = [a, b, third];
-        triplet.sort_unstable();
-        found.push((weakest(&third), triplet));
     }
     found.sort_by_key(|&(weakest, views)| (Reverse(weakest), views));
     found.dedup();
     diverse(found.into_iter().map(|(_, views)| views).collect(), OPTIONS.most_triplets)
+}
+
+/// Number of tracks that a view shares with each open one; 0 with itself.
+fn shared_tracks(problem: &Problem, open: &[bool], view: usize) -> Vec<usize> {
+    let mut shared = vec![0; problem.views()];
+    let tracks = problem.of_view[view].iter().map(|&k| problem.track_of(k as usize));
+    for track in tracks.filter(|&track| problem.supports_growth(track, false)) {
+        let seen = problem.of_track(track).map(|k| problem.view_of(k));
+        seen.filter(|&other| open[other]).for_each(|other| shared[other] += 1);
+    }
+    shared[view] = 0;
+    shared
 }
 
 /// The views in which anything is observed, if at least half of the tracks that are observed at all, and enough of
@@ -309,6 +326,19 @@ mod tests {
         assert_eq!(found[..4], [[0, 1, 2, 3], [20, 21, 22, 23], [0, 3, 6, 9], [20, 23, 26, 29]]);
         assert!(found.iter().all(|views| views.is_sorted()));
         assert!(subsets(&[(0..4).collect()]).is_empty());
+    }
+
+    /// Pairs of three views share 12 tracks, those of three others 20 but for one that shares 9; among empty views.
+    #[test]
+    fn triplets_are_ranked_by_their_weakest_pair() {
+        let pairs = [([1, 2], 12), ([1, 400], 12), ([2, 400], 12), ([3, 5], 20), ([3, 7], 20), ([5, 7], 9)];
+        let tracks: Vec<Vec<usize>> = pairs.iter().flat_map(|&(pair, count)| vec![pair.to_vec(); count]).collect();
+        let input = input(800, &tracks);
+        let among = |open: Vec<bool>| with_problem(&input, |problem| triplets(problem, &open));
+        assert_eq!(among(vec![true; 800]), [[1, 2, 400], [3, 5, 7]]);
+        assert_eq!(among((0..800).map(|view| view != 400).collect()), [[3, 5, 7]]);
+        assert!(among((0..800).map(|view| view < 6).collect()).is_empty());
+        assert!(with_problem(&input, candidate_views).is_empty());
     }
 
     #[test]

@@ -68,6 +68,8 @@ pub struct Options {
     pub relative_tolerance: f64,
     /// First damping, relative to the diagonal of the normal equations.
     pub initial_damping: f64,
+    /// Ends as hopeless where it will not get below this cost, see [`levenberg_marquardt::Options::hopeless_above`].
+    pub hopeless_above: f64,
     pub loss: Loss,
 }
 
@@ -79,8 +81,14 @@ impl Options {
 
     /// What the loop asks.
     fn of_loop(&self, min_damping: f64) -> levenberg_marquardt::Options {
-        let Self { max_iterations, relative_tolerance, initial_damping, .. } = *self;
-        levenberg_marquardt::Options { max_iterations, relative_tolerance, initial_damping, min_damping }
+        let Self { max_iterations, relative_tolerance, initial_damping, hopeless_above, loss: _ } = *self;
+        levenberg_marquardt::Options {
+            max_iterations,
+            relative_tolerance,
+            initial_damping,
+            min_damping,
+            hopeless_above,
+        }
     }
 }
 
@@ -88,6 +96,12 @@ impl Default for Options {
     /// Converges from an algebraic solution: 30 steps are rarely used up, and a cost that moves by less than 1e-7 is
     /// far below the noise it is compared with.
     fn default() -> Self {
-        Self { max_iterations: 30, relative_tolerance: 1e-7, initial_damping: 1e-4, loss: Loss::Squared }
+        Self {
+            max_iterations: 30,
+            relative_tolerance: 1e-7,
+            initial_damping: 1e-4,
+            hopeless_above: f64::INFINITY,
+            loss: Loss::Squared,
+        }
     }
 }

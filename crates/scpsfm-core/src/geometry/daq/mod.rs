@@ -133,6 +133,7 @@ pub fn refine(cameras: &[Matrix3x4<f64>], start: Daq, free: Free, max_iterations
         relative_tolerance: RELATIVE_TOLERANCE,
         initial_damping: INITIAL_DAMPING,
         min_damping: MIN_DAMPING,
+        hopeless_above: f64::INFINITY,
     };
     let mut best = start;
     let mut refinement = Refinement { cameras, free, normal: Normal::zeros() };

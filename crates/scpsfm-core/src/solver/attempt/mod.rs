@@ -18,7 +18,7 @@ use super::problem::Problem;
 use super::recorder::Recorder;
 use super::sequence::ProjectiveReconstruction;
 use super::{Error, all_tracks, near_duplicates, scpsfm, second_structures, static_tracks, track_sampling};
-use crate::domain::{FocalPrior, Grade, Method, Proposal, Stage, WarningCode};
+use crate::domain::{FocalPrior, Grade, Method, Stage, WarningCode};
 use crate::geometry::bundle::metric::{Intrinsics, MetricReconstruction};
 use crate::geometry::statistics::median;
 
@@ -76,15 +76,17 @@ impl Attempt {
 
     /// What was found of some of the views of a block by other tracks than its complete ones; `None`: nothing.
     pub fn of_projective(block: Block, found: Option<ProjectiveReconstruction>) -> Self {
-        let mut attempt = Self::new(block);
-        attempt.found.winning_proposal = found.is_some().then_some(Proposal::Uniform);
-        attempt.projective = found.map(ProjectiveReconstruction::oriented);
-        attempt
+        Self { projective: found.map(ProjectiveReconstruction::oriented), ..Self::new(block) }
     }
 
     /// Views that have a camera, increasing.
     pub fn views(&self) -> &[usize] {
         self.projective.as_ref().map_or(&[], |projective| &projective.views)
+    }
+
+    /// Whether it has less than half of the views.
+    pub fn leaves_most_views(&self, problem: &Problem) -> bool {
+        2 * self.views().len() < problem.observed_views().len()
     }
 
     /// Evidence of what stands, see [`ProjectiveReconstruction::evidence`]; 0 where nothing does.

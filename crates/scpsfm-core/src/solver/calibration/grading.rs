@@ -130,16 +130,21 @@ fn chosen(
         return Ok((best, minima));
     }
     let least_in_front = problem.options.grades.least_in_front;
-    for minimum in &mut minima {
+    let mut others = Vec::with_capacity(minima.len());
+    for start in minima {
         Error::check(choice.stop)?;
-        *minimum = choice.search(&best.priors).converged(minimum.reconstruction.clone(), best.model);
+        let search = choice.search(&best.priors);
+        let Some(mut minimum) = search.converged_near(start.reconstruction, best.model, best.minimum.cost) else {
+            continue;
+        };
         // A model that is wrong may rank the minima wrongly.
         if minimum.cost < best.minimum.cost && minimum.cheirality >= least_in_front.min(best.minimum.cheirality) {
             let better = Candidate::new(minimum.clone(), best.model, best.priors.clone(), problem);
-            *minimum = std::mem::replace(&mut best, better).minimum;
+            minimum = std::mem::replace(&mut best, better).minimum;
         }
+        others.push(minimum);
     }
-    Ok((best, minima))
+    Ok((best, others))
 }
 
 /// The cheapest minimum whose points are in front of the cameras, if the data do not tell it from the cheapest.

@@ -128,8 +128,8 @@ options! {
         final_iterations: usize = 60,
         final_tolerance: f64 = 1e-9,
         /// Multiple of the cheapest minimum's cost: a start that at its pace does not get below is not adjusted to
-        /// convergence. A rival is within a few per cent, and one stuck at thirty times the cost took half the time of
-        /// a calibration.
+        /// convergence. A rival is within a few per cent, and one that is stuck far above took half the time of a
+        /// calibration.
         hopeless_cost: f64 = 4.0,
         /// Adjusted starts this near in log focal, and within this share in cost, are the same minimum.
         same_minimum: f64 = 0.01,

@@ -3,14 +3,14 @@
 use nalgebra::{Vector2, Vector3};
 
 use super::fit::Fit;
-use super::options::SearchOptions;
+use super::options::{CalibrationOptions, SearchOptions};
 use super::{Error, Uncalibrated};
 use crate::domain::StopToken;
-use crate::geometry::bundle::Options;
 use crate::geometry::bundle::critical::Translating;
 use crate::geometry::bundle::metric::{
     self, Information, Intrinsics, IntrinsicsModel, IntrinsicsPrior, MetricReconstruction,
 };
+use crate::geometry::bundle::{Options, Report};
 use crate::geometry::daq::{self, CanonicalFrame, Daq, Free};
 use crate::geometry::metric::{cheirality, upgrade, upgrade_translation};
 use crate::geometry::observation::Observation;
@@ -99,11 +99,47 @@ impl Search<'_> {
         self.adjusted(&self.problem.options.search.to_convergence(), start, model)
     }
 
+    /// The same; `None` where its cost will not come near this one, so that it is none to compare with.
+    pub fn converged_near(&self, start: MetricReconstruction, model: IntrinsicsModel, cost: f64) -> Option<Minimum> {
+        let CalibrationOptions { search: options, grades, .. } = self.problem.options;
+        // Of costs below the noise no difference tells anything.
+        let told_apart = cost + grades.indistinguishable * self.problem.noise.powi(2);
+        let hopeless_above = (options.hopeless_cost * cost).max(told_apart);
+        let (minimum, report) = self.run(&Options { hopeless_above, ..options.to_convergence() }, start, model);
+        (!report.is_hopeless).then_some(minimum)
+    }
+
+    /// What these converge to, cheapest first, without those whose cost will not come near the cheapest.
+    ///
+    /// * `heartbeat`: called after each
+    fn converged_all(
+        &self,
+        starts: impl IntoIterator<Item = MetricReconstruction>,
+        model: IntrinsicsModel,
+        heartbeat: &mut dyn FnMut(),
+    ) -> Result<Vec<Minimum>, Error> {
+        let (mut found, mut cheapest) = (Vec::new(), f64::INFINITY);
+        for start in starts {
+            Error::check(self.stop)?;
+            if let Some(minimum) = self.converged_near(start, model, cheapest) {
+                cheapest = cheapest.min(minimum.cost);
+                found.push(minimum);
+            }
+            heartbeat();
+        }
+        Error::check(self.stop)?;
+        Ok(distinct(found, self.problem))
+    }
+
     fn adjusted(&self, options: &Options, start: MetricReconstruction, model: IntrinsicsModel) -> Minimum {
+        self.run(options, start, model).0
+    }
+
+    fn run(&self, options: &Options, start: MetricReconstruction, model: IntrinsicsModel) -> (Minimum, Report) {
         let (mut reconstruction, observations) = (start, self.problem.observations);
         let report = metric::adjust(&mut reconstruction, observations, model, self.priors, options, self.stop);
         let cheirality = cheirality(&reconstruction, observations);
-        Minimum { reconstruction, cost: report.cost, cheirality }
+        (Minimum { reconstruction, cost: report.cost, cheirality }, report)
     }
 
     /// Minima from a reconstruction that is metric already, cheapest first: those that other focal lengths lead to,
@@ -119,9 +155,7 @@ impl Search<'_> {
     ) -> Result<Vec<Minimum>, Error> {
         let model = IntrinsicsModel::focal(metric.has_own_focals());
         let max_iterations = self.problem.options.search.following_iterations;
-        let mut found = Vec::new();
-        for &factor in factors {
-            Error::check(self.stop)?;
+        let start = |&factor: &f64| {
             let mut reconstruction = metric.clone();
             reconstruction.intrinsics.iter_mut().for_each(|lens| *lens = lens.simplest());
             reconstruction.scale_focals(factor);
@@ -129,11 +163,9 @@ impl Search<'_> {
                 let following = Options { max_iterations, ..Options::default() };
                 reconstruction = self.adjusted(&following, reconstruction, IntrinsicsModel::FIXED).reconstruction;
             }
-            found.push(self.converged(reconstruction, model));
-            heartbeat();
-        }
-        Error::check(self.stop)?;
-        Ok(distinct(found, self.problem))
+            reconstruction
+        };
+        self.converged_all(factors.iter().map(start), model, heartbeat)
     }
 
     /// Metric reconstructions with the focal length free, or one of each view, that different starts converge to,
@@ -150,13 +182,9 @@ impl Search<'_> {
     fn minima_of_groups(&self, frame: &CanonicalFrame) -> Result<Vec<Minimum>, Error> {
         let problem = self.problem;
         let alone = Uncalibrated { group_of: &vec![0; frame.cameras.len()], focal_priors: &[None], ..*problem };
-        let mut found = Search { problem: &alone, ..*self }.minima_per_view(frame)?;
-        for minimum in &mut found {
-            Error::check(self.stop)?;
-            let in_groups = minimum.reconstruction.clone().in_groups(problem.group_of, problem.groups());
-            *minimum = self.converged(in_groups, IntrinsicsModel::FOCAL);
-        }
-        Ok(distinct(found, problem))
+        let found = Search { problem: &alone, ..*self }.minima_per_view(frame)?;
+        let in_groups = |minimum: Minimum| minimum.reconstruction.in_groups(problem.group_of, problem.groups());
+        self.converged_all(found.into_iter().map(in_groups), IntrinsicsModel::FOCAL, &mut || ())
     }
 
     /// With a focal length a view, of which nothing is known: from the quadrics that allow for that, and from what one
@@ -176,11 +204,7 @@ impl Search<'_> {
         }
         let mut found = distinct(found, problem);
         found.truncate(options.converged);
-        for minimum in &mut found {
-            Error::check(self.stop)?;
-            *minimum = search.converged(minimum.reconstruction.clone(), model);
-        }
-        Ok(distinct(found, problem))
+        search.converged_all(found.into_iter().map(|minimum| minimum.reconstruction), model, &mut || ())
     }
 
     /// With one focal length for all views.
@@ -200,18 +224,9 @@ impl Search<'_> {
         found.truncate(options.converged);
         let mut converged: Vec<Minimum> = Vec::with_capacity(found.len());
         let mut cheapest = f64::INFINITY;
-        for mut start in found {
+        for start in found {
             Error::check(self.stop)?;
-            if start.cost > options.hopeless_cost * cheapest {
-                let tried = on_subset.adjusted(&options.first(), start.reconstruction, model);
-                let pace =
-                    (tried.cost / start.cost).powf(options.final_iterations as f64 / options.first_iterations as f64);
-                if pace * tried.cost > options.hopeless_cost * cheapest {
-                    continue;
-                }
-                start = tried;
-            }
-            let mut minimum = on_subset.converged(start.reconstruction, model);
+            let Some(mut minimum) = on_subset.converged_near(start.reconstruction, model, cheapest) else { continue };
             cheapest = cheapest.min(minimum.cost);
             if let Some(chosen) = &chosen {
                 fill_points(&mut minimum, chosen, problem.observations);
@@ -227,18 +242,14 @@ impl Search<'_> {
     pub fn minima_from(&self, starts: Vec<MetricReconstruction>) -> Result<Vec<Minimum>, Error> {
         let problem = self.problem;
         let model = IntrinsicsModel::focal(problem.focal_per_view);
-        let mut found = Vec::with_capacity(starts.len());
-        for mut start in starts {
-            Error::check(self.stop)?;
+        let start = |mut start: MetricReconstruction| {
             start.intrinsics.iter_mut().for_each(|intrinsics| *intrinsics = Intrinsics::from_focal(intrinsics.focal));
-            let start = match problem.focal_per_view {
+            match problem.focal_per_view {
                 true => start.with_own_focals(),
                 false => start.in_groups(problem.group_of, problem.groups()),
-            };
-            found.push(self.converged(start, model));
-        }
-        Error::check(self.stop)?;
-        Ok(distinct(found, problem))
+            }
+        };
+        self.converged_all(starts.into_iter().map(start), model, &mut || ())
     }
 
     /// The metric reconstruction of a camera that moved without turning, from a focal length that is known otherwise;

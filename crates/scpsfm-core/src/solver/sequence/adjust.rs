@@ -111,18 +111,18 @@ impl Extract {
         self.observations.iter().map(squared).collect()
     }
 
-    /// Core noise of the residuals: their median, for what their freedom leaves of it.
-    fn noise(&self) -> f64 {
+    /// Core noise of the residuals, see [`core_noise`].
+    fn noise(&self) -> Option<f64> {
         let norms = self.squared_residuals().into_iter().map(f64::sqrt).collect();
         core_noise(norms, self.sequence.unknowns(self.tracks.len(), 0))
     }
 }
 
 /// Core noise, one standard deviation of a coordinate, by the median of these norms of residuals, for what their
-/// freedom leaves of it.
-pub fn core_noise(mut norms: Vec<f64>, unknowns: usize) -> f64 {
+/// freedom leaves of it; `None` where that is next to nothing: a few points fit any noise.
+pub fn core_noise(mut norms: Vec<f64>, unknowns: usize) -> Option<f64> {
     let freedom = 1.0 - unknowns as f64 / (2 * norms.len()).max(1) as f64;
-    median(&mut norms) / RAYLEIGH_MEDIAN / freedom.max(ADJUSTMENT.least_freedom).sqrt()
+    (freedom >= ADJUSTMENT.least_freedom).then(|| median(&mut norms) / RAYLEIGH_MEDIAN / freedom.sqrt())
 }
 
 /// What is known of the intrinsics of a camera before any observation.
@@ -207,7 +207,9 @@ fn finish(problem: &Problem, model: &mut Model, extract: &Extract) {
         return;
     }
     extract.write_back(model);
-    model.set_noise(problem, extract.noise());
+    if let Some(noise) = extract.noise() {
+        model.set_noise(problem, noise);
+    }
 }
 
 /// Tracks with a verified landmark, increasing.
@@ -259,4 +261,19 @@ pub fn rescale(problem: &Problem, model: &mut Model, component: u32) {
     }
     let landmarks = model.landmarks.iter_mut().flatten().filter(|landmark| landmark.component == component);
     landmarks.for_each(|landmark| landmark.position *= scale);
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// Two coordinates of each of 100 observations; with 198 unknowns the residuals are those that the fit has chosen.
+    #[test]
+    fn noise_is_told_by_residuals_that_have_freedom() {
+        let noise = |unknowns: usize| core_noise(vec![2.0 * RAYLEIGH_MEDIAN; 100], unknowns);
+        assert_eq!(noise(0), Some(2.0));
+        assert!(noise(100).is_some_and(|noise| (noise - 2.0 * 2f64.sqrt()).abs() < 1e-12));
+        assert_eq!(noise(198), None);
+        assert_eq!(core_noise(Vec::new(), 0), Some(0.0));
+    }
 }

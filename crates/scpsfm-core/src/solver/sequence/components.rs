@@ -4,6 +4,7 @@
 use super::growth::Trial;
 use super::model::{Lens, Model};
 use super::options::{ComponentOptions, GrowthOptions};
+use super::triplets::Pairs;
 use super::{merging, register, structure};
 use crate::domain::{FocalPrior, Grade};
 use crate::geometry::bundle::metric::Intrinsics;
@@ -11,6 +12,7 @@ use crate::solver::attempt::{self, Attempt, Effort};
 use crate::solver::calibration::Outcome;
 use crate::solver::problem::Problem;
 use crate::solver::recorder::Recorder;
+use crate::solver::view_selection::SeedViews;
 use crate::solver::{Error, view_selection};
 
 const OPTIONS: ComponentOptions = ComponentOptions::DEFAULT;
@@ -35,8 +37,8 @@ pub fn first(problem: &Problem, seed: &Attempt, recorder: &mut Recorder) -> Mode
     model
 }
 
-/// Solves and extends block after block of the views that are left, as long as there are any: blocks of one camera, then
-/// of several together.
+/// Solves and extends what may be a component, one after the other, as long as there is any among the views that are
+/// left: blocks of one camera, then of several together, then triplets.
 ///
 /// # Errors
 /// [`Error::Stopped`]; [`Error::Internal`] for defects.
@@ -48,19 +50,28 @@ pub fn others(
     recorder: &mut Recorder,
 ) -> Result<(), Error> {
     let mut component = FIRST;
-    // Of one camera there are no blocks of several.
-    for cameras in [Cameras::One, Cameras::Several].into_iter().take(problem.cameras) {
+    let mut pairs = Pairs::new(problem);
+    for kind in [SeedKind::OfOneCamera, SeedKind::OfSeveral, SeedKind::Triplet] {
         let mut open: Vec<bool> = model.poses.iter().map(Option::is_none).collect();
         let mut failures = 0;
         while component + 1 < OPTIONS.most_components && failures < OPTIONS.most_failures {
             problem.stopped()?;
-            let Some(views) = next_block(problem, &open, cameras) else { break };
+            let Some(seed_views) = next_seed(problem, &open, kind) else { break };
             component += 1;
             recorder.begin_component(component);
             let priors = priors(problem, seed, model);
-            let attempt = attempt::solve_block(problem, problem.block(&views), SEED, &priors, recorder)?;
+            let (attempt, views) = match seed_views {
+                SeedViews::Block(views) => {
+                    (attempt::solve_block(problem, problem.block(&views), SEED, &priors, recorder)?, views)
+                }
+                SeedViews::Triplet(views) => {
+                    let mut attempt = pairs.attempt(&views, recorder)?;
+                    attempt::calibrate(problem, &mut attempt, &priors, recorder)?;
+                    (attempt, views.to_vec())
+                }
+            };
             recorder.end_component();
-            // Whatever comes of it, a block is tried once.
+            // Whatever comes of it, it is tried once.
             views.iter().for_each(|&view| open[view] = false);
             let is_added = add(problem, model, component, &attempt, trials, recorder)?;
             failures = if is_added { 0 } else { failures + 1 };
@@ -103,26 +114,37 @@ fn add(
     Ok(stands)
 }
 
-/// Which views a block may hold.
+/// What a component begins from.
 #[derive(Debug, Clone, Copy)]
-enum Cameras {
-    One,
-    Several,
+enum SeedKind {
+    /// A block of the views of one camera.
+    OfOneCamera,
+    /// A block of several cameras.
+    OfSeveral,
+    /// Three views that share tracks in pairs.
+    Triplet,
 }
 
-/// The best block of open views.
-fn next_block(problem: &Problem, open: &[bool], cameras: Cameras) -> Option<Vec<usize>> {
-    let among = |open: &[bool]| {
-        let is_worth = open.iter().filter(|open| **open).count() >= view_selection::LEAST_VIEWS;
-        let found = || view_selection::candidate_views_among(problem, open).into_iter().next();
-        (is_worth && !problem.stop.is_stopped()).then(found).flatten()
+/// The best seed of this kind among open views.
+fn next_seed(problem: &Problem, open: &[bool], kind: SeedKind) -> Option<SeedViews> {
+    let is_worth = |open: &[bool]| {
+        open.iter().filter(|open| **open).count() >= view_selection::LEAST_VIEWS && !problem.stop.is_stopped()
     };
-    match cameras {
-        Cameras::One => (0..problem.cameras).find_map(|camera| {
+    let block_among = |open: &[bool]| {
+        let found = || view_selection::candidate_views_among(problem, open).into_iter().next();
+        is_worth(open).then(found).flatten().map(SeedViews::Block)
+    };
+    match kind {
+        SeedKind::OfOneCamera => (0..problem.cameras).find_map(|camera| {
             let is_open = |(open, of): (&bool, &usize)| *open && *of == camera;
-            among(&open.iter().zip(&problem.camera_of).map(is_open).collect::<Vec<bool>>())
+            block_among(&open.iter().zip(&problem.camera_of).map(is_open).collect::<Vec<bool>>())
         }),
-        Cameras::Several => among(open),
+        // Of one camera there are no blocks of several.
+        SeedKind::OfSeveral => (problem.cameras > 1).then(|| block_among(open)).flatten(),
+        SeedKind::Triplet => {
+            let found = || view_selection::triplets(problem, open).into_iter().next();
+            is_worth(open).then(found).flatten().map(SeedViews::Triplet)
+        }
     }
 }
 

@@ -4,7 +4,8 @@
 //! tracks holds them all. A block that was searched is the seed. Where it is calibrated, view after view is resected
 //! against the points that stand ([`register`], [`growth`]), its tracks are triangulated ([`structure`]), and bundle
 //! adjustment with the calibration free keeps the whole straight ([`adjust`]); where it is not, the same is done
-//! without a calibration ([`projective_growth`]), and the whole is calibrated then. Views that share too few tracks with
+//! without a calibration ([`projective_growth`]), and the whole is calibrated then. Where no block leads to most views,
+//! three that share tracks in pairs are the seed ([`triplets`]). Views that share too few tracks with
 //! it become [`components`] of their own under the same calibration, and are merged where all that they share tells how
 //! ([`merging`]). What the whole says of the calibration is graded anew ([`calibrate`]) and checked between its
 //! [`windows`]. This file decides which blocks are tried and what is made of them; [`extended`] is the metric extension
@@ -40,6 +41,7 @@ use super::learned::TrackScoreOptions;
 use super::problem::Problem;
 use super::reconstruction::Reconstruction;
 use super::recorder::Recorder;
+use super::view_selection::SeedViews;
 use super::{Error, view_selection};
 use crate::domain::Stage;
 use extended::extend;
@@ -78,7 +80,8 @@ pub fn solve(problem: &mut Problem, recorder: &mut Recorder) -> Result<Ended, Er
 /// Solves and extends block after block until one carries a reconstruction of most of the views.
 ///
 /// In order of cost: the blocks, searched quickly, calibrated and extended metrically; what they found and small
-/// subsets of them, extended projectively and calibrated then. Only where none of these stands: the blocks again, with
+/// subsets of them, extended projectively and calibrated then; where that is not METRIC and holds less than half of the
+/// views, triplets in the same way. Only where none of these stands: the blocks again, with
 /// everything that a search can try, and the subsets that are left. An input whose tracks are mostly complete is its
 /// only block; with depths it is searched at length at once.
 ///
@@ -105,9 +108,11 @@ fn of_blocks(problem: &Problem, recorder: &mut Recorder) -> Result<Ended, Error>
     let (cheap, rest) = subsets.split_at(cheap);
     // Nothing else is searched of a whole input with depths: what it has found stands.
     let mut best = by_projective_extension(problem, None, starts(first, !is_quick, cheap), recorder)?;
-    if !blocks.is_whole && metric.is_none() && !holds_most_views(problem, &best) {
-        let triplets = view_selection::triplets(problem).into_iter().map(Start::Triplet).collect();
-        best = by_projective_extension(problem, best, triplets, recorder)?;
+    let leaves_most = |best: &Attempt| !best.is_good() && best.leaves_most_views(problem);
+    if !blocks.is_whole && metric.is_none() && best.as_ref().is_none_or(leaves_most) {
+        let triplets = view_selection::triplets(problem, &vec![true; problem.views()]);
+        let starts = triplets.into_iter().map(|views| Start::Views(SeedViews::Triplet(views))).collect();
+        best = by_projective_extension(problem, best, starts, recorder)?;
     }
     if is_quick && metric.is_none() && !stands(&best) {
         let first = match blocks.by_calibration(problem, false, recorder)? {
@@ -135,10 +140,9 @@ impl Ended {
         match self {
             Ended::Extended(extended) => !extended.is_calibrated(problem) || !extended.holds_most_views(),
             Ended::Block(attempt) => attempt.as_ref().is_some_and(|attempt| {
-                let leaves_most = 2 * attempt.views().len() < problem.observed_views().len();
                 attempt.projective.is_some()
                     && attempt.judges_observations()
-                    && (!attempt.is_calibrated() || leaves_most)
+                    && (!attempt.is_calibrated() || attempt.leaves_most_views(problem))
             }),
         }
     }
@@ -214,11 +218,6 @@ fn stands(attempt: &Option<Attempt>) -> bool {
     attempt.as_ref().is_some_and(|attempt| attempt.projective.is_some())
 }
 
-/// Whether there is a reconstruction of half of the views or more.
-fn holds_most_views(problem: &Problem, attempt: &Option<Attempt>) -> bool {
-    attempt.as_ref().is_some_and(|attempt| 2 * attempt.views().len() >= problem.observed_views().len())
-}
-
 /// The whole input as one block, with the views that its search left aside, and the tracks that depths did not verify.
 fn of_whole(problem: &Problem, views: &[usize], is_quick: bool, recorder: &mut Recorder) -> Result<Attempt, Error> {
     let effort = Effort { is_quick, is_seed: false };
@@ -278,18 +277,19 @@ fn by_calibrated_blocks(
 
 /// What a projective extension begins from.
 enum Start {
-    /// What was found already, and whether it stands as it is where its extension leaves too little.
-    Found(Box<Attempt>, bool),
-    /// The tracks that are complete over these views.
-    Block(Vec<usize>),
-    /// The tracks that two or three of these views share.
-    Triplet([usize; 3]),
+    /// What was found already.
+    Found {
+        attempt: Box<Attempt>,
+        /// Whether it stands as it is where its extension leaves too little.
+        keeps: bool,
+    },
+    Views(SeedViews),
 }
 
-/// What was found already, then these sets of views.
+/// What was found already, then the blocks of these sets of views.
 fn starts(found: Option<Attempt>, keeps: bool, sets: &[Vec<usize>]) -> Vec<Start> {
-    let found = found.map(|attempt| Start::Found(Box::new(attempt), keeps));
-    found.into_iter().chain(sets.iter().cloned().map(Start::Block)).collect()
+    let found = found.map(|attempt| Start::Found { attempt: Box::new(attempt), keeps });
+    found.into_iter().chain(sets.iter().map(|views| Start::Views(SeedViews::Block(views.clone())))).collect()
 }
 
 /// The best of one that stands and of these, each extended to all views without a calibration and, where it is not
@@ -305,17 +305,17 @@ fn by_projective_extension(
     let count = starts.len();
     for (k, start) in starts.into_iter().enumerate() {
         problem.stopped()?;
-        if !matches!(start, Start::Found(..)) {
-            recorder.begin_block(k, count);
-        }
         let (mut attempt, keeps) = match start {
-            Start::Found(attempt, keeps) => (*attempt, keeps),
-            Start::Block(views) => {
-                (attempt::search_block(problem, problem.block(&views), QUICK_SEED, recorder)?, false)
-            }
-            Start::Triplet(views) => {
-                recorder.enter(Stage::Search);
-                (Attempt::of_projective(problem.block(&views), pairs.reconstruction(&views)), false)
+            Start::Found { attempt, keeps } => (*attempt, keeps),
+            Start::Views(views) => {
+                recorder.begin_block(k, count);
+                let attempt = match views {
+                    SeedViews::Block(views) => {
+                        attempt::search_block(problem, problem.block(&views), QUICK_SEED, recorder)?
+                    }
+                    SeedViews::Triplet(views) => pairs.attempt(&views, recorder)?,
+                };
+                (attempt, false)
             }
         };
         extend_projectively(problem, &mut attempt, keeps, recorder)?;

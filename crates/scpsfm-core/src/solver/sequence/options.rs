@@ -78,7 +78,9 @@ options! {
         views_around: usize = 6,
         /// Iterations around a new view. They start at what was adjusted before.
         iterations_around: usize = 3,
-        /// Least share of the observations' freedom that is left to the residuals, however few landmarks there are.
+        /// Share of the observations' freedom that must be left to the residuals for their noise to be believed. With
+        /// less the fit decides what they are: a component of three points fitted these exactly, and closed the gates
+        /// of all that came after it.
         least_freedom: f64 = 0.2,
         /// Least noise that is believed, pixels. Exact input would close every gate.
         least_noise_px: f64 = 0.01,
@@ -118,15 +120,15 @@ options! {
 options! {
     /// How three views that share tracks in pairs become a seed.
     pub struct TripletOptions {
-        /// Noise of the matches, in units of what is assumed, which is rather too high: with few matches that tell right
-        /// from wrong only the narrower gates do.
+        /// Noise of the matches, in units of what is assumed, which is rather too high: a dozen matches that agree
+        /// within ten times their noise may do so by chance.
         noise_levels: [f64; 3] = [1.0, 0.3, 0.1],
-        /// Tracks of a pair at most, evenly spread: their fundamental matrix has seven unknowns.
-        most_tracks: usize = 300,
-        /// Iterations of the first adjustment of their cameras.
+        /// Tracks of a pair at most, evenly spread: as many as make a block no better.
+        most_tracks: usize = ViewSelectionOptions::DEFAULT.enough_tracks,
+        /// Iterations of the first adjustment of their cameras: those of an algebraic solution.
         iterations: usize = 30,
-        /// Share of the tracks that agree with a fundamental matrix which must have a point by all three cameras. A
-        /// matrix of another body's motion, or of wrong matches, contradicts the other two.
+        /// Share of the tracks of the pairs of which the adjusted cameras must have a point. The matrix of another body
+        /// contradicts the other two, as three matrices have three unknowns more than three cameras.
         least_share: f64 = 0.7,
     }
 }

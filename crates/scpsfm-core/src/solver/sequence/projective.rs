@@ -60,7 +60,7 @@ impl ProjectiveReconstruction {
             }
         }
         let norms = self.squared_residuals().into_iter().map(f64::sqrt).collect();
-        self.noise = adjust::core_noise(norms, self.unknowns());
+        self.noise = adjust::core_noise(norms, self.unknowns()).unwrap_or(self.noise);
         self
     }
 

@@ -94,22 +94,25 @@ impl<'a> Growing<'a> {
         self.support[track] >= VERIFIED
     }
 
-    /// Whether too few verified points hold a view, so that those of two views count too. Nothing verifies these, but
-    /// views that are linked by few tracks have no others.
-    fn is_loose(&self, view: usize) -> bool {
-        let verified = self.problem.of_view[view].iter().filter(|&&k| {
-            let track = self.problem.track_of(k as usize);
-            self.is_verified(track)
-        });
+    /// Whether so few verified points support a view that those of two views count too: those that it agrees with where
+    /// it is registered, else those that it sees. Nothing verifies points of two views, but views that are linked by
+    /// few tracks have no others.
+    fn needs_two_view_points(&self, view: usize) -> bool {
+        let is_registered = self.cameras[view].is_some();
+        let verified = self.problem.of_view[view]
+            .iter()
+            .map(|&k| k as usize)
+            .filter(|&k| self.is_verified(self.problem.track_of(k)) && (self.kept[k] || !is_registered));
         verified.count() < self.options.least_agreeing
     }
 
-    /// The observations of a view whose points may support its camera: the verified ones, or all of a loose view.
+    /// The observations of a view whose points may support its camera: the verified ones, and where it needs
+    /// them those of two views.
     fn points_for(&self, view: usize) -> impl Iterator<Item = usize> {
-        let is_loose = self.is_loose(view);
+        let takes_all = self.needs_two_view_points(view);
         let supports = move |&k: &usize| {
             let track = self.problem.track_of(k);
-            self.is_verified(track) || is_loose && self.points[track].is_some()
+            self.is_verified(track) || takes_all && self.support[track] >= 2
         };
         self.problem.of_view[view].iter().map(|&k| k as usize).filter(supports)
     }
@@ -154,12 +157,12 @@ impl<'a> Growing<'a> {
         (0..self.points.len()).filter(|&track| self.is_verified(track)).collect()
     }
 
-    /// The verified points, and all of loose views.
-    fn holding(&self) -> Vec<usize> {
-        let is_loose: Vec<bool> = (0..self.cameras.len()).map(|view| self.is_loose(view)).collect();
+    /// The tracks that an adjustment is made by: the verified ones, and those of two views where a view needs them.
+    fn adjusted_tracks(&self) -> Vec<usize> {
+        let takes_all: Vec<bool> = (0..self.cameras.len()).map(|view| self.needs_two_view_points(view)).collect();
         let holds = |&track: &usize| {
             let mut seen = self.problem.of_track(track).filter(|&k| self.kept[k]);
-            self.is_verified(track) || seen.any(|k| is_loose[self.problem.view_of(k)])
+            self.is_verified(track) || self.support[track] >= 2 && seen.any(|k| takes_all[self.problem.view_of(k)])
         };
         (0..self.points.len()).filter(holds).collect()
     }
@@ -190,7 +193,7 @@ impl<'a> Growing<'a> {
 
     /// Adjusts all registered views with the points that hold them best, and estimates the noise from what remains.
     fn adjust(&mut self, iterations: usize, recorder: &mut Recorder) {
-        let mut reconstruction = self.reconstruction(self.holding(), self.options.of_view);
+        let mut reconstruction = self.reconstruction(self.adjusted_tracks(), self.options.of_view);
         if reconstruction.observations.is_empty() {
             return;
         }
@@ -201,7 +204,7 @@ impl<'a> Growing<'a> {
         if self.problem.stop.is_stopped() {
             return;
         }
-        self.noise = self.noise_of(&reconstruction);
+        self.noise = self.noise_of(&reconstruction).unwrap_or(self.noise);
         let reconstruction = reconstruction.oriented();
         reconstruction
             .views
@@ -210,13 +213,13 @@ impl<'a> Growing<'a> {
             .for_each(|(&view, camera)| self.cameras[view] = Some(*camera));
     }
 
-    /// Core noise of the residuals: their median, for what their freedom leaves of it.
-    fn noise_of(&self, reconstruction: &ProjectiveReconstruction) -> f64 {
+    /// Core noise of the residuals within bounds, see [`adjust::core_noise`].
+    fn noise_of(&self, reconstruction: &ProjectiveReconstruction) -> Option<f64> {
         let norms: Vec<f64> = reconstruction.squared_residuals().into_iter().map(f64::sqrt).collect();
         let unknowns = CAMERA_UNKNOWNS * reconstruction.views.len() + 3 * reconstruction.tracks.len();
-        let noise = adjust::core_noise(norms, unknowns);
+        let noise = adjust::core_noise(norms, unknowns)?;
         let (least, most) = NoiseOptions::DEFAULT.bounds;
-        noise.clamp(least, (self.options.noise_growth * self.start_noise).min(most))
+        Some(noise.clamp(least, (self.options.noise_growth * self.start_noise).min(most)))
     }
 
     /// Takes back the views that too few points hold, and returns them.

@@ -1,7 +1,8 @@
-//! Seeds of inputs whose views share tracks in pairs, but no three of them enough: three views, by the fundamental
-//! matrices of their pairs.
+//! Seeds of three views that share tracks in pairs, by the fundamental matrices of these: where tracks are scattered,
+//! no three views may share enough for a block.
 
 use std::collections::BTreeMap;
+use std::f64::consts::SQRT_2;
 
 use nalgebra::Vector2;
 use rand::SeedableRng;
@@ -9,6 +10,7 @@ use rand_chacha::ChaCha8Rng;
 
 use super::options::{GrowthOptions, TripletOptions};
 use super::projective::ProjectiveReconstruction;
+use crate::domain::Stage;
 use crate::geometry::bundle;
 use crate::geometry::fundamental::{self, Fundamental, Match};
 use crate::geometry::observation::Observation;
@@ -16,8 +18,11 @@ use crate::geometry::robust_triangulation::Triangulator;
 use crate::geometry::statistics::ln_choose;
 use crate::geometry::three_views::{self, FundamentalMatrices};
 use crate::geometry::{Camera, triangulation};
+use crate::solver::Error;
 use crate::solver::a_contrario::FalseAlarmOptions;
+use crate::solver::attempt::Attempt;
 use crate::solver::problem::Problem;
+use crate::solver::recorder::Recorder;
 use crate::solver::view_selection::evenly;
 
 const OPTIONS: TripletOptions = TripletOptions::DEFAULT;
@@ -43,11 +48,22 @@ impl<'a> Pairs<'a> {
         Self { problem, known: BTreeMap::new() }
     }
 
+    /// What is found of a triplet.
+    ///
+    /// # Errors
+    /// [`Error::Stopped`].
+    pub fn attempt(&mut self, views: &[usize; 3], recorder: &mut Recorder) -> Result<Attempt, Error> {
+        recorder.enter(Stage::Search);
+        let found = self.reconstruction(views);
+        self.problem.stopped()?;
+        Ok(Attempt::of_projective(self.problem.block(views), found))
+    }
+
     /// The reconstruction of three views by the tracks that two or three of them see; `None` where the pairs have no
-    /// epipolar geometry that more tracks agree with than by chance, or no three cameras agree with all of them.
+    /// epipolar geometry that more tracks agree with than by chance, or no three cameras see most of these tracks.
     ///
     /// * `views`: increasing
-    pub fn reconstruction(&mut self, views: &[usize; 3]) -> Option<ProjectiveReconstruction> {
+    fn reconstruction(&mut self, views: &[usize; 3]) -> Option<ProjectiveReconstruction> {
         let [first, second, third] = *views;
         let first_to_second = self.pair(first, second)?;
         let first_to_third = self.pair(first, third)?;
@@ -82,8 +98,8 @@ impl<'a> Pairs<'a> {
         (found.tracks.len() as f64 >= OPTIONS.least_share * tried).then_some(found)
     }
 
-    /// The cameras adjusted to these tracks. What is linear in matrices of a dozen matches each is too far off to be gated
-    /// at their noise.
+    /// The cameras adjusted to these tracks. What is linear in matrices of a dozen matches each is too far off to be
+    /// gated at their noise.
     fn adjusted(&self, views: &[usize; 3], mut cameras: Vec<Camera>, tracks: Vec<usize>) -> ProjectiveReconstruction {
         let problem = self.problem;
         let (mut points, mut observations) = (Vec::new(), Vec::new());
@@ -122,7 +138,8 @@ impl<'a> Pairs<'a> {
     }
 }
 
-/// The epipolar geometry of two views that most tracks agree with for the noise, where that is no chance.
+/// The epipolar geometry of two views that is least likely by chance, of all noise levels, all observations alike;
+/// `None` where one such is to be expected.
 fn pair(problem: &Problem, from: usize, to: usize) -> Option<Pair> {
     let tracks: Vec<usize> = problem.of_view[from].iter().map(|&k| problem.track_of(k as usize)).collect();
     let shared = |track: &usize| problem.supports_growth(*track, false) && seen_by(problem, *track, to).is_some();
@@ -149,15 +166,15 @@ fn pair(problem: &Problem, from: usize, to: usize) -> Option<Pair> {
 
 /// Natural logarithm of the number of such fundamental matrices to be expected among matches without structure:
 /// a-contrario as by Moisan & Stival (2004, section 3), `C(m, k) C(k, 8) a^(k - 8)` at each noise, where `a` is the
-/// probability that a point anywhere in the image is as near its epipolar line.
+/// probability that a point anywhere in the image is as near an epipolar line, a diagonal at the longest.
 fn ln_false_alarms(matches: usize, inliers: usize, noise: f64, outlier_density: f64) -> f64 {
     let determine = fundamental::LEAST_MATCHES;
     if inliers <= determine {
         return f64::INFINITY;
     }
-    // The distance of either point from its line is √2 Sampson distances, to both sides.
-    let width = 2.0 * (2.0 * fundamental::squared_gate(noise)).sqrt();
-    let ln_by_chance = (width * outlier_density).min(1.0).ln();
+    // The point that is nearer its line is √2 Sampson distances from it at most, to either side.
+    let width = 2.0 * SQRT_2 * fundamental::squared_gate(noise).sqrt();
+    let ln_by_chance = (SQRT_2 * width * outlier_density).min(1.0).ln();
     let levels = OPTIONS.noise_levels.len() as f64;
     levels.ln()
         + ln_choose(matches, inliers)

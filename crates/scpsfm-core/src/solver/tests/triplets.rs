@@ -1,8 +1,8 @@
 //! Inputs whose views share tracks in pairs, but no three of them enough.
 
-use rand::SeedableRng;
 use std::collections::BTreeMap;
 
+use rand::SeedableRng;
 use rand::seq::index;
 use rand_chacha::ChaCha8Rng;
 
@@ -68,12 +68,14 @@ fn views_that_share_tracks_in_pairs_alone_are_reconstructed() {
     }
 }
 
-/// Pairs of views agree with some fundamental matrix by chance, and no three with three cameras.
+/// Pairs of views agree with some fundamental matrix by chance, and no three of these with three cameras.
 #[test]
 fn pairs_of_views_without_structure_are_no_reconstruction() {
     for seed in 0..5 {
         let (input, _) = scattered(seed, 1.0);
         let solution = solved(&input, &SolveSettings { seed, ..SolveSettings::default() });
         assert_eq!(solution.status, Status::NoReconstruction, "seed {seed}: {:?}", solution.warnings);
+        let reason = solution.warnings.iter().find(|warning| warning.code == WarningCode::FewInliers);
+        assert!(reason.is_some_and(|reason| reason.detail.contains("more than by chance")), "{:?}", solution.warnings);
     }
 }

@@ -48,7 +48,7 @@ pub fn adjust(
 ) -> Report {
     let Run { threads, stop, heartbeat } = run;
     let mut cancellation = CancellationCheck::new(stop);
-    let unknown = Report { initial_cost: f64::INFINITY, cost: f64::INFINITY, iterations: 0 };
+    let unknown = Report::at(f64::INFINITY);
     let Some(layout) = Layout::new(sequence, observations, free, &mut cancellation) else { return unknown };
     let pool = WorkerPool::new(&layout, threads, stop);
     let loss = options.loss;
@@ -57,8 +57,7 @@ pub fn adjust(
         Some((Solver::new(&pattern)?, pattern))
     };
     let Some((solver, pattern)) = (!layout.is_empty()).then(solvable).flatten() else {
-        let cost = cost(sequence, priors, loss, &pool).unwrap_or(f64::INFINITY);
-        return Report { initial_cost: cost, cost, iterations: 0 };
+        return Report::at(cost(sequence, priors, loss, &pool).unwrap_or(f64::INFINITY));
     };
     let normal = Normal::new(&layout, &pattern, sequence);
     let reduced = Reduced::new(&layout, pattern);
