@@ -1,7 +1,7 @@
 //! A result in a few lines for people.
 
 use super::next_steps::{self, Files};
-use crate::domain::{Grade, Solution, Status};
+use crate::domain::{Grade, Method, Solution, Status};
 use crate::formats::result_json::{CameraGroupJson, camera_groups};
 use crate::formats::{LabelledInput, result_files, warnings};
 
@@ -9,6 +9,8 @@ use crate::formats::{LabelledInput, result_files, warnings};
 const MOST_CAMERAS: usize = 20;
 /// Parts whose views are counted one by one.
 const MOST_PARTS: usize = 10;
+/// Observations of a track in registered views from which it is judged: two fit a point whether they are right or not.
+const LEAST_JUDGED: usize = 3;
 
 /// The result in words, one fact a line, without a newline at the end; without the input, warnings number the views.
 pub fn text(solution: &Solution, input: Option<&LabelledInput>) -> String {
@@ -40,6 +42,10 @@ pub fn text(solution: &Solution, input: Option<&LabelledInput>) -> String {
             solution.inlier_observation_count()
         ),
     );
+    match input.map_or(0, |input| unjudged(solution, input)) {
+        0 => {}
+        count => fact("not judged", format!("{count} tracks: fewer than {LEAST_JUDGED} registered views see them")),
+    }
     if !solution.splits.is_empty() {
         fact("splits", format!("{} further points in tracks that join several", solution.splits.len()));
     }
@@ -65,6 +71,18 @@ pub fn text(solution: &Solution, input: Option<&LabelledInput>) -> String {
         lines.push(format!("  warning: {}: {}", warning.code.name(), warning.detail));
     }
     lines.join("\n")
+}
+
+/// Tracks that nothing is said of, as too few registered views see them; of a method that judges observations.
+fn unjudged(solution: &Solution, input: &LabelledInput) -> usize {
+    if solution.status != Status::Solved || !matches!(solution.method, Method::Auto | Method::Geometry) {
+        return 0;
+    }
+    let mut seen = vec![0usize; solution.tracks.inlier.len()];
+    for (&view, &track) in input.raw.view.iter().zip(&input.raw.track) {
+        seen[track as usize] += usize::from(solution.views[view as usize].projection.is_some());
+    }
+    seen.into_iter().filter(|&count| count < LEAST_JUDGED).count()
 }
 
 /// The same with where the files are and what to do next.
@@ -145,6 +163,15 @@ mod tests {
         assert!(lines.contains("warning: FEW_INLIERS: "), "{lines}");
         solution.calibrations[0].sigma_log_focal = None;
         assert!(text(&solution, None).contains("unobservable"));
+    }
+
+    #[test]
+    fn tells_how_many_tracks_nothing_is_said_of() {
+        let (input, mut solution) = fixture::solved();
+        assert!(!text(&solution, Some(&input)).contains("not judged"), "{}", text(&solution, Some(&input)));
+        solution.views[..3].iter_mut().for_each(|view| view.projection = None);
+        let lines = text(&solution, Some(&input));
+        assert!(lines.contains("not judged   40 tracks: fewer than 3 registered views see them"), "{lines}");
     }
 
     #[test]

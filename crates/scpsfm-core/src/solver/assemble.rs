@@ -267,12 +267,16 @@ fn why_unsolved(problem: &Problem, best: Option<&Attempt>) -> Warning {
             WarningCode::NoConsensus,
             format!("{} views given; a reconstruction needs at least {}", problem.views(), LEAST_VIEWS),
         ),
+        None if problem.ranges.windows(2).all(|range| range[1] - range[0] < LEAST_VIEWS) => Warning::new(
+            WarningCode::FewInliers,
+            format!("no track is seen in {LEAST_VIEWS} views: points that fewer see verify nothing"),
+        ),
         None => Warning::new(
             WarningCode::FewInliers,
             format!(
-                "no {LEAST_VIEWS} views share enough tracks, at least {LEAST_INLIERS} of which no two are equal, and \
-                 no {LEAST_VIEWS} of which every two share at least {LEAST_SHARED_BY_PAIR} hold together more than by \
-                 chance",
+                "no {LEAST_VIEWS} views are enough to begin with: they need {LEAST_INLIERS} tracks that all of them \
+                 see, no two of them equal, or {LEAST_SHARED_BY_PAIR} that every two of them see and a fourth view \
+                 that sees as many of these, and the tracks must agree more than by chance"
             ),
         ),
         // All 0: too little is observed for a head to run.
