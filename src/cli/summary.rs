@@ -4,13 +4,12 @@ use super::next_steps::{self, Files};
 use crate::domain::{Grade, Method, Solution, Status};
 use crate::formats::result_json::{CameraGroupJson, camera_groups};
 use crate::formats::{LabelledInput, result_files, warnings};
+use crate::solver::VERIFIED;
 
 /// Cameras told one by one; a photo collection may have one an image, and result.json has them all.
 const MOST_CAMERAS: usize = 20;
 /// Parts whose views are counted one by one.
 const MOST_PARTS: usize = 10;
-/// Observations of a track in registered views from which it is judged: two fit a point whether they are right or not.
-const LEAST_JUDGED: usize = 3;
 
 /// The result in words, one fact a line, without a newline at the end; without the input, warnings number the views.
 pub fn text(solution: &Solution, input: Option<&LabelledInput>) -> String {
@@ -44,7 +43,7 @@ pub fn text(solution: &Solution, input: Option<&LabelledInput>) -> String {
     );
     match input.map_or(0, |input| unjudged(solution, input)) {
         0 => {}
-        count => fact("not judged", format!("{count} tracks: fewer than {LEAST_JUDGED} registered views see them")),
+        count => fact("not judged", format!("{count} tracks: fewer than {VERIFIED} registered views see them")),
     }
     if !solution.splits.is_empty() {
         fact("splits", format!("{} further points in tracks that join several", solution.splits.len()));
@@ -82,7 +81,7 @@ fn unjudged(solution: &Solution, input: &LabelledInput) -> usize {
     for (&view, &track) in input.raw.view.iter().zip(&input.raw.track) {
         seen[track as usize] += usize::from(solution.views[view as usize].projection.is_some());
     }
-    seen.into_iter().filter(|&count| count < LEAST_JUDGED).count()
+    seen.into_iter().filter(|&count| count < VERIFIED).count()
 }
 
 /// The same with where the files are and what to do next.

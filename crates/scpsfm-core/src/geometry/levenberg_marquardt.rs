@@ -98,7 +98,8 @@ pub(crate) fn minimise<P: LeastSquares>(
     stop: &StopToken,
 ) -> Report {
     let mut report = Report::at(problem.cost(state));
-    let mut costs = vec![report.cost];
+    // After the last steps, each at its number modulo theirs.
+    let mut costs = [report.cost; PACE_STEPS];
     let mut trial = state.clone();
     let mut damping = options.initial_damping.max(options.min_damping);
     while report.iterations < options.max_iterations && report.cost > 0.0 && !stop.is_stopped() {
@@ -120,12 +121,13 @@ pub(crate) fn minimise<P: LeastSquares>(
         damping = (damping * factor_after(gain / predicted)).max(options.min_damping);
         report.cost = cost;
         report.iterations += 1;
-        costs.push(cost);
+        let before = std::mem::replace(&mut costs[report.iterations % PACE_STEPS], cost);
         if gain < options.relative_tolerance * cost {
             break;
         }
-        if is_hopeless(&costs, options) {
-            report.is_hopeless = true;
+        report.is_hopeless = report.iterations >= PACE_STEPS
+            && is_hopeless(before, cost, options.max_iterations - report.iterations, options.hopeless_above);
+        if report.is_hopeless {
             break;
         }
     }
@@ -134,12 +136,10 @@ pub(crate) fn minimise<P: LeastSquares>(
 
 /// See [`Options::hopeless_above`].
 ///
-/// * `costs`: at the start and after every step
-fn is_hopeless(costs: &[f64], options: &Options) -> bool {
-    let Some(first) = costs.len().checked_sub(PACE_STEPS + 1) else { return false };
-    let (before, cost) = (costs[first], costs[costs.len() - 1]);
-    let left = (options.max_iterations + 1 - costs.len()) as f64 / PACE_STEPS as f64;
-    cost * (cost / before).powf(left) > options.hopeless_above
+/// * `before`: cost [`PACE_STEPS`] ago
+/// * `left`: steps
+fn is_hopeless(before: f64, cost: f64, left: usize, hopeless_above: f64) -> bool {
+    cost * (cost / before).powf(left as f64 / PACE_STEPS as f64) > hopeless_above
 }
 
 /// Nielsen's factor on the damping after a step that gained this share of what was predicted; the least where that is
@@ -244,13 +244,9 @@ mod tests {
     /// Steps of which each takes a tenth of the cost: .9³⁰ of it is left after 30.
     #[test]
     fn a_descent_ends_where_its_pace_leads_nowhere() {
-        let costs: Vec<f64> = (0..=PACE_STEPS as i32).map(|step| 0.9f64.powi(step)).collect();
-        let ends = |costs: &[f64], hopeless_above: f64| {
-            is_hopeless(costs, &Options { max_iterations: 30, hopeless_above, ..OPTIONS })
-        };
-        let last = 0.9f64.powi(30);
-        assert!(ends(&costs, 0.99 * last) && !ends(&costs, 1.01 * last));
-        assert!(!ends(&costs, f64::INFINITY) && !ends(&costs[1..], 0.0), "too few steps to tell");
+        let [now, last] = [PACE_STEPS as i32, 30].map(|steps| 0.9f64.powi(steps));
+        let ends = |hopeless_above: f64| is_hopeless(1.0, now, 30 - PACE_STEPS, hopeless_above);
+        assert!(ends(0.99 * last) && !ends(1.01 * last) && !ends(f64::INFINITY));
         let mut state = Vector2::new(-1.2, 1.0);
         let options = Options { hopeless_above: 1e-3, ..OPTIONS };
         let report = minimise(&mut Valley(Normal::zeros()), &mut state, &options, &StopToken::default());
@@ -258,7 +254,7 @@ mod tests {
         // A thousandth of every step leads nowhere.
         let mut state = Vector2::new(-1.2, 1.0);
         let report = minimise(&mut Slow(Valley(Normal::zeros())), &mut state, &options, &StopToken::default());
-        assert!(report.is_hopeless && report.iterations < 30, "{report:?}");
+        assert!(report.is_hopeless && (PACE_STEPS..30).contains(&report.iterations), "{report:?}");
     }
 
     /// A thousandth of every step.

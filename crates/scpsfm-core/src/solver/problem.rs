@@ -237,6 +237,11 @@ impl<'a> Problem<'a> {
         self.ranges[track]..self.ranges[track + 1]
     }
 
+    /// The observation of a track in a view, the first of several.
+    pub fn seen_in(&self, track: usize, view: usize) -> Option<usize> {
+        self.of_track(track).find(|&k| self.view_of(k) == view)
+    }
+
     /// Whether another track represents this one.
     pub fn is_near_duplicate(&self, track: usize) -> bool {
         self.representative[track] != track

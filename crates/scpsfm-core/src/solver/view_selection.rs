@@ -212,7 +212,7 @@ fn greedy_views(problem: &Problem, open: &[bool], least: usize) -> Vec<Vec<usize
                 break;
             }
             views.push(next);
-            tracks.retain(|&track| problem.of_track(track).any(|k| problem.view_of(k) == next));
+            tracks.retain(|&track| problem.seen_in(track, next).is_some());
             if views.len() >= LEAST_VIEWS {
                 let value = count.min(OPTIONS.enough_tracks) * (views.len() - 2);
                 if best.as_ref().is_none_or(|(most, _)| value > *most) {

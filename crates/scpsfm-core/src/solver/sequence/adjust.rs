@@ -119,9 +119,9 @@ impl Extract {
 }
 
 /// Core noise, one standard deviation of a coordinate, by the median of these norms of residuals, for what their
-/// freedom leaves of it; `None` where that is next to nothing: a few points fit any noise.
+/// freedom leaves of it; `None` where that is next to nothing, as a few points fit any noise, and without residuals.
 pub fn core_noise(mut norms: Vec<f64>, unknowns: usize) -> Option<f64> {
-    let freedom = 1.0 - unknowns as f64 / (2 * norms.len()).max(1) as f64;
+    let freedom = 1.0 - unknowns as f64 / (2 * norms.len()) as f64;
     (freedom >= ADJUSTMENT.least_freedom).then(|| median(&mut norms) / RAYLEIGH_MEDIAN / freedom.sqrt())
 }
 
@@ -274,6 +274,6 @@ mod tests {
         assert_eq!(noise(0), Some(2.0));
         assert!(noise(100).is_some_and(|noise| (noise - 2.0 * 2f64.sqrt()).abs() < 1e-12));
         assert_eq!(noise(198), None);
-        assert_eq!(core_noise(Vec::new(), 0), Some(0.0));
+        assert_eq!([0, 6].map(|unknowns| core_noise(Vec::new(), unknowns)), [None; 2]);
     }
 }

@@ -5,10 +5,10 @@
 //! against the points that stand ([`register`], [`growth`]), its tracks are triangulated ([`structure`]), and bundle
 //! adjustment with the calibration free keeps the whole straight ([`adjust`]); where it is not, the same is done
 //! without a calibration ([`projective_growth`]), and the whole is calibrated then. Where no block leads to most views,
-//! three that share tracks in pairs are the seed ([`triplets`]). Views that share too few tracks with
-//! it become [`components`] of their own under the same calibration, and are merged where all that they share tells how
+//! three that share tracks in pairs are the seed ([`triplets`]). Views that share too few tracks with it become
+//! [`components`] of their own under the same calibration, and are merged where all that they share tells how
 //! ([`merging`]). What the whole says of the calibration is graded anew ([`calibrate`]) and checked between its
-//! [`windows`]. This file decides which blocks are tried and what is made of them; [`extended`] is the metric extension
+//! [`windows`]. This file decides which seeds are tried and what is made of them; [`extended`] is the metric extension
 //! of one.
 
 mod adjust;
@@ -81,9 +81,9 @@ pub fn solve(problem: &mut Problem, recorder: &mut Recorder) -> Result<Ended, Er
 ///
 /// In order of cost: the blocks, searched quickly, calibrated and extended metrically; what they found and small
 /// subsets of them, extended projectively and calibrated then; where that is not METRIC and holds less than half of the
-/// views, triplets in the same way. Only where none of these stands: the blocks again, with
-/// everything that a search can try, and the subsets that are left. An input whose tracks are mostly complete is its
-/// only block; with depths it is searched at length at once.
+/// views, triplets in the same way. Only where none of these stands: the blocks again, with everything that a search
+/// can try, and the subsets that are left. An input whose tracks are mostly complete is its only block; with depths it
+/// is searched at length at once.
 ///
 /// # Errors
 /// [`Error::Stopped`]; [`Error::Internal`] for defects.

@@ -55,7 +55,7 @@ impl ProjectiveReconstruction {
         }
         for seen in &mut self.observations {
             let (view, track) = (self.views[seen.view], self.tracks[seen.point]);
-            if let Some(k) = problem.of_track(track).find(|&k| problem.view_of(k) == view) {
+            if let Some(k) = problem.seen_in(track, view) {
                 seen.weight = problem.pinhole_observation(k).weight / problem.weights[k];
             }
         }

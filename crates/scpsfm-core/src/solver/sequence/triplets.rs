@@ -141,15 +141,18 @@ impl<'a> Pairs<'a> {
 /// The epipolar geometry of two views that is least likely by chance, of all noise levels, all observations alike;
 /// `None` where one such is to be expected.
 fn pair(problem: &Problem, from: usize, to: usize) -> Option<Pair> {
-    let tracks: Vec<usize> = problem.of_view[from].iter().map(|&k| problem.track_of(k as usize)).collect();
-    let shared = |track: &usize| problem.supports_growth(*track, false) && seen_by(problem, *track, to).is_some();
-    let tracks: Vec<usize> = tracks.into_iter().filter(shared).collect();
-    let tracks = evenly(&tracks, OPTIONS.most_tracks);
-    let seen = |&track: &usize| {
-        let [from, to] = [from, to].map(|view| seen_by(problem, track, view));
-        Some(Match { from: from?.xy, to: to?.xy })
+    let shared = |&k: &usize| {
+        let track = problem.track_of(k);
+        problem.supports_growth(track, false) && problem.seen_in(track, to).is_some()
     };
-    let matches: Vec<Match> = tracks.iter().filter_map(seen).collect();
+    let shared: Vec<usize> = problem.of_view[from].iter().map(|&k| k as usize).filter(shared).collect();
+    let match_of = |k: usize| {
+        let track = problem.track_of(k);
+        let to = seen_by(problem, track, to)?;
+        Some((track, Match { from: problem.pinhole_observation(k).xy, to: to.xy }))
+    };
+    let matched = evenly(&shared, OPTIONS.most_tracks).into_iter().filter_map(match_of);
+    let (tracks, matches): (Vec<usize>, Vec<Match>) = matched.unzip();
     let of_noise = |level: &f64| {
         let noise = level * problem.initial_noise;
         let mut rng = ChaCha8Rng::seed_from_u64(problem.settings.seed);
@@ -184,5 +187,5 @@ fn ln_false_alarms(matches: usize, inliers: usize, noise: f64, outlier_density: 
 
 /// The observation of a track in a view, where a pinhole would have made it.
 fn seen_by(problem: &Problem, track: usize, view: usize) -> Option<Observation> {
-    problem.of_track(track).find(|&k| problem.view_of(k) == view).map(|k| problem.pinhole_observation(k))
+    problem.seen_in(track, view).map(|k| problem.pinhole_observation(k))
 }
