@@ -113,6 +113,7 @@ pub(crate) fn solved_sequence(options: &SequenceOptions) -> (LabelledInput, Solu
             network_weight: Vec::new(),
             point: truth.inlier.iter().zip(&truth.points).map(|(&yes, &point)| yes.then_some(point)).collect(),
             part: Vec::new(),
+            second_structure: Vec::new(),
         },
         observations: ObservationResults {
             inlier: truth.observation_right.clone(),
@@ -212,6 +213,7 @@ fn solution(scene: &Scene) -> Solution {
             network_weight: weight(0.8, 0.2),
             point: inlier.iter().zip(&truth.points).map(|(&yes, &point)| yes.then_some(point)).collect(),
             part: Vec::new(),
+            second_structure: Vec::new(),
         },
         observations: ObservationResults {
             inlier: (0..count).map(inlier_of).collect(),

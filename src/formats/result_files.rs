@@ -93,20 +93,25 @@ pub fn said(directory: &Path, solution: &Solution) -> String {
     format!("{}; {POINTS} holds the points of part 0, {others} those of the others", directory.display())
 }
 
-/// `track,weight,inlier`, `network_weight` where a network ran, and the `part` that the track has a point in, empty
-/// where it has none; one line a track.
+/// `track,weight,inlier`, `network_weight` where a network ran, the `part` that the track has a point in, empty where it
+/// has none, and `second_structure` where one was found; one line a track.
 fn tracks_csv(solution: &Solution, input: Option<&LabelledInput>) -> String {
     let tracks = &solution.tracks;
-    let has_network = !tracks.network_weight.is_empty();
+    let (has_network, has_second) = (!tracks.network_weight.is_empty(), !tracks.second_structure.is_empty());
     let mut text = String::from("track,weight,inlier");
-    text.push_str(if has_network { ",network_weight,part\n" } else { ",part\n" });
+    text.push_str(if has_network { ",network_weight,part" } else { ",part" });
+    text.push_str(if has_second { ",second_structure\n" } else { "\n" });
     for (track, (weight, &inlier)) in tracks.weight.iter().zip(&tracks.inlier).enumerate() {
         text.push_str(&format!("{},{weight},{}", track_label(input, track).csv(), u8::from(inlier)));
         if has_network {
             text.push_str(&format!(",{}", tracks.network_weight.get(track).copied().unwrap_or(0.0)));
         }
         let part = tracks.part_of(track).map_or_else(String::new, |part| part.to_string());
-        text.push_str(&format!(",{part}\n"));
+        text.push_str(&format!(",{part}"));
+        if has_second {
+            text.push_str(&format!(",{}", u8::from(tracks.second_structure.get(track) == Some(&true))));
+        }
+        text.push('\n');
     }
     text
 }

@@ -307,6 +307,19 @@ fn without_a_network_there_is_no_fourth_column_and_without_the_input_no_observat
 }
 
 #[test]
+fn tracks_of_a_second_structure_are_marked() {
+    let (_, mut solution) = fixture::solved();
+    let rejected = solution.tracks.inlier.iter().position(|&inlier| !inlier).expect("an outlier");
+    solution.tracks.second_structure = (0..solution.tracks.inlier.len()).map(|track| track == rejected).collect();
+    let text = tracks_csv(&solution, None);
+    let lines: Vec<&str> = text.lines().collect();
+    assert_eq!(lines[0], "track,weight,inlier,network_weight,part,second_structure");
+    let marked: Vec<usize> = (1..lines.len()).filter(|&line| lines[line].ends_with(",1")).collect();
+    assert_eq!(marked, [rejected + 1]);
+    assert!(lines[1..].iter().all(|line| line.split(',').count() == 6), "{text}");
+}
+
+#[test]
 fn the_same_solution_gives_the_same_bytes_but_for_times() {
     let (input, solution) = fixture::solved();
     let directory = tempfile::tempdir().expect("a temporary directory");

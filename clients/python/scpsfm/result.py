@@ -295,6 +295,9 @@ class TrackResults:
     network_weight: NDArray[np.float32] | None
     """What a network says of the track by itself, 0 to 1; `None`: none ran. (tracks,)."""
 
+    second_structure: NDArray[np.bool_]
+    """Whether the track, no inlier, agrees with the motion that `SECOND_STRUCTURE` tells of. (tracks,)."""
+
     points: Floats
     """X, Y, Z of each track; NaN where it has no point. (tracks, 3)."""
 
@@ -577,11 +580,12 @@ class Result:
         part[self.point_track_indices] = self.point_parts
         for row in (points, part):
             row.setflags(write=False)
-        network = message.network_weights
+        network, second = message.network_weights, message.second_structures
         return TrackResults(
             weight=_row(message.weights, np.float32, count, "weights of tracks"),
             inlier=inlier,
             network_weight=_row(network, np.float32, count, "weights of a network") if network else None,
+            second_structure=_row(second or [False] * count, np.bool_, count, "tracks of a second structure"),
             points=points,
             part=part,
         )

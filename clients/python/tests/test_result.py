@@ -31,6 +31,10 @@ def test_a_result_is_arrays(small: scene.Scene) -> None:
     assert np.array_equal(result.points, small.points[small.right])
     assert result.point_track_indices.tolist() == np.flatnonzero(small.right).tolist()
     assert result.tracks.network_weight is None
+    assert not result.tracks.second_structure.any()
+    message = scene.true_result(small)
+    message.tracks.second_structures.extend(~small.right)
+    assert np.array_equal(Result(message, small.tracks).tracks.second_structure, ~small.right)
     assert result.observations.inlier.shape == (len(small.tracks),)
     for array in (result.points, result.tracks.inlier, result.tracks.points, result.observations.residual_px):
         with pytest.raises(ValueError, match="read-only"):

@@ -119,6 +119,8 @@ pub struct Measured {
     pub focals: Vec<FocalError>,
     /// Whether the answer warns that the metric model does not fit.
     pub mismatch: bool,
+    /// Whether the answer warns of a second structure.
+    pub second_structure: bool,
     /// CPU time of the solve; of a peer its whole process, without what `--help` takes.
     pub seconds: f64,
     pub failure: Option<String>,
@@ -140,6 +142,7 @@ struct Answer {
     grade: Option<Grade>,
     focals: Vec<FocalError>,
     mismatch: bool,
+    second_structure: bool,
     seconds: f64,
 }
 
@@ -153,6 +156,7 @@ impl Measured {
             grade: answer.grade,
             focals: answer.focals,
             mismatch: answer.mismatch,
+            second_structure: answer.second_structure,
             seconds: answer.seconds,
             kept: count(&answer.observations),
             ..Self::without_answer(sample)

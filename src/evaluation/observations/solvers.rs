@@ -30,11 +30,13 @@ pub fn ours(sample: &Sample, declared: Declared, stop: &StopToken) -> Result<Opt
     let spent = begun.zip(child::thread_cpu_seconds()).map(|(begun, now)| now - begun);
     let largest = (0..solution.part_count()).max_by_key(|&part| (views_of(&solution, part).count(), Reverse(part)));
     let registered: Vec<usize> = largest.map_or_else(Vec::new, |part| views_of(&solution, part).collect());
+    let warns = |code: WarningCode| solution.warnings.iter().any(|warning| warning.code == code);
     Ok(Some(Answer {
         views: share_of_due(sample, registered.iter().filter(|&&view| sample.due[view]).count()),
         grade: solution.grade,
         focals: focals(sample, &solution),
-        mismatch: solution.warnings.iter().any(|warning| warning.code == WarningCode::ModelMismatch),
+        mismatch: warns(WarningCode::ModelMismatch),
+        second_structure: warns(WarningCode::SecondStructure),
         seconds: spent.unwrap_or(solution.seconds),
         tracks: solution.tracks.inlier,
         observations: solution.observations.inlier,

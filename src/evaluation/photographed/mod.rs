@@ -132,6 +132,8 @@ pub struct Row {
     /// Mean over the scenes that have verifiable observations, and views with enough of them.
     pub recall: Option<f64>,
     pub views: Option<f64>,
+    /// Share of the answers that tell of a second structure; a peer tells none.
+    pub second_structure: Option<f64>,
     pub seconds: f64,
     pub failures: Vec<String>,
 }
@@ -143,6 +145,7 @@ impl Row {
         let beyond = |grade: Grade| of(grade).filter_map(deviation).map(|sigmas| f64::from(sigmas > BELIED_SIGMAS));
         let within = of(Grade::Metric).filter_map(deviation).map(|sigmas| f64::from(sigmas <= ONE_SIGMA));
         let wanted = || here.iter().copied().filter(|measured| measured.wanted > 0);
+        let ours = || here.iter().filter(|_| side == Side::Scpsfm);
         let due = || here.iter().copied().filter(|measured| measured.due > 0);
         Self {
             group,
@@ -159,6 +162,7 @@ impl Row {
             precision: mean(here.iter().filter(|measured| measured.kept > 0).map(|measured| measured.precision)),
             recall: mean(wanted().map(|measured| measured.recall)),
             views: mean(due().map(|measured| measured.views)),
+            second_structure: mean(ours().map(|measured| f64::from(measured.second_structure))),
             seconds: mean(here.iter().map(|measured| measured.seconds)).unwrap_or(0.0),
             failures: here.iter().filter_map(|measured| measured.failure.clone()).collect(),
         }

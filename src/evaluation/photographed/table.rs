@@ -11,7 +11,8 @@ these. METR: METRIC answers; of these >3sg %: share beyond 3 sigma; off: number 
 1sg: share within 1 sigma (.68 where sigma is right). WEAK: WEAK answers and their share beyond 3 sigma. obs P:
 precision over the observations that were kept, of answers that keep any. obs R: recall over the verifiable
 observations, the right ones of tracks with at least three. views: registered share of those with 15 verifiable
-observations or more. CPU s: mean; a peer's without what its start takes. A peer gets the scenes of one focal length.
+observations or more. 2nd %: share of the answers with SECOND_STRUCTURE. CPU s: mean; a peer's without what its start
+takes. A peer gets the scenes of one focal length.
 ";
 
 /// A line a row.
@@ -23,7 +24,7 @@ pub fn text(tables: &[Table]) -> String {
     for table in tables {
         let _ = writeln!(
             text,
-            "{:<width$} {:<6}{:>5}{:>8}{:>7}{:>6}{:>8}{:>5}{:>8}{:>6}{:>8}{:>8}{:>8}{:>8}{:>9}",
+            "{:<width$} {:<6}{:>5}{:>8}{:>7}{:>6}{:>8}{:>5}{:>8}{:>6}{:>8}{:>8}{:>8}{:>8}{:>7}{:>9}",
             table.by,
             "side",
             "n",
@@ -38,6 +39,7 @@ pub fn text(tables: &[Table]) -> String {
             "obs P",
             "obs R",
             "views",
+            "2nd %",
             "CPU s"
         );
         table.rows.iter().for_each(|row| line(&mut text, width, row));
@@ -55,7 +57,7 @@ fn line(text: &mut String, width: usize, row: &Row) {
     let shown = |value: Option<f64>| value.map_or_else(|| "-".to_owned(), |value| format!("{value:.3}"));
     let _ = writeln!(
         text,
-        "{:<width$} {:<6}{:>5}{:>8.2}{:>7}{:>6}{:>8}{:>5}{:>8}{:>6}{:>8}{:>8}{:>8}{:>8}{:>9.2}",
+        "{:<width$} {:<6}{:>5}{:>8.2}{:>7}{:>6}{:>8}{:>5}{:>8}{:>6}{:>8}{:>8}{:>8}{:>8}{:>7}{:>9.2}",
         row.group,
         row.side.name(),
         row.scenes,
@@ -70,6 +72,7 @@ fn line(text: &mut String, width: usize, row: &Row) {
         shown(row.precision),
         shown(row.recall),
         shown(row.views),
+        percent(row.second_structure),
         row.seconds
     );
 }

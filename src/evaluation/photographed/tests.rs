@@ -24,7 +24,7 @@ fn a_row_tells_refused_from_impossible_and_belied_from_covered() {
     let answers = [
         answer(metric, &[0.005], Some(0.005)),
         answer(metric, &[0.035], Some(0.005)),
-        answer(metric, &[0.005, -0.05], Some(0.02)),
+        Measured { second_structure: true, ..answer(metric, &[0.005, -0.05], Some(0.02)) },
         answer(weak, &[0.02], None),
         nothing,
     ];
@@ -34,6 +34,8 @@ fn a_row_tells_refused_from_impossible_and_belied_from_covered() {
     // 3.5 sigma, and the root mean square of .5 and 5: beyond 3; off by more than 4 sigma only the latter.
     assert_eq!((row.metric_belied, row.metric_wrong), (Some(2.0 / 3.0), 1));
     assert_eq!((row.coverage, row.weak_belied), (Some(1.0 / 3.0), Some(0.0)));
+    assert_eq!(row.second_structure, Some(0.2));
+    assert_eq!(Row::of("all", Side::Peer, &answers.iter().collect::<Vec<_>>()).second_structure, None);
     // What keeps nothing makes no false claim, and finds nothing.
     assert_eq!((row.precision, row.recall, row.views), (Some(1.0), Some(0.4), Some(0.8)));
 }

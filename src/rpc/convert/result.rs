@@ -286,12 +286,15 @@ fn tracks_to_wire(tracks: &TrackResults) -> proto::TrackResults {
         } else {
             with_point().map(|(track, _)| tracks.part_of(track).unwrap_or(0)).collect()
         },
+        second_structures: tracks.second_structure.clone(),
     }
 }
 
 fn tracks_from_wire(tracks: proto::TrackResults) -> Result<TrackResults, Violation> {
     let count = tracks.weights.len();
-    if tracks.inliers.len() != count || !(tracks.network_weights.is_empty() || tracks.network_weights.len() == count) {
+    let is_of_all = |length: usize| length == 0 || length == count;
+    let are_of_all = is_of_all(tracks.network_weights.len()) && is_of_all(tracks.second_structures.len());
+    if tracks.inliers.len() != count || !are_of_all {
         return Err(Violation::of("tracks", format!("arrays of different lengths beside {count} weights")));
     }
     if tracks.points.len() != 3 * tracks.point_track_indices.len() {
@@ -316,8 +319,15 @@ fn tracks_from_wire(tracks: proto::TrackResults) -> Result<TrackResults, Violati
             *part = of;
         }
     }
-    let proto::TrackResults { weights, inliers, network_weights, .. } = tracks;
-    Ok(TrackResults { weight: weights, inlier: inliers, network_weight: network_weights, point, part })
+    let proto::TrackResults { weights, inliers, network_weights, second_structures, .. } = tracks;
+    Ok(TrackResults {
+        weight: weights,
+        inlier: inliers,
+        network_weight: network_weights,
+        point,
+        part,
+        second_structure: second_structures,
+    })
 }
 
 fn observations_to_wire(observations: &ObservationResults) -> proto::ObservationResults {

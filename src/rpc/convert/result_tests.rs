@@ -96,6 +96,7 @@ pub(super) fn rich() -> Solution {
             network_weight: vec![0.1, 0.2, 0.3],
             point: vec![None, Some([1.0, -2.0, 3.5]), None],
             part: vec![0, 1, 0],
+            second_structure: vec![false, false, true],
         },
         observations: ObservationResults {
             inlier: vec![true, false, false],

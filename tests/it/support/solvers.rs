@@ -94,6 +94,7 @@ pub fn solution(input: &Input, settings: &SolveSettings) -> Solution {
             network_weight: Vec::new(),
             point: vec![None; tracks],
             part: Vec::new(),
+            second_structure: Vec::new(),
         },
         observations: ObservationResults {
             inlier: vec![true; input.observation_count()],

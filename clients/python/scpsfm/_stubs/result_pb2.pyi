@@ -205,20 +205,22 @@ class ViewResult(_message.Message):
     def __init__(self, projection: _Optional[_Iterable[float]] = ..., rotation: _Optional[_Iterable[float]] = ..., translation: _Optional[_Iterable[float]] = ..., focal_px: _Optional[float] = ..., part: _Optional[int] = ..., camera_group: _Optional[int] = ..., left_out: _Optional[_Union[LeftOut, _Mapping]] = ..., name: _Optional[str] = ...) -> None: ...
 
 class TrackResults(_message.Message):
-    __slots__ = ("weights", "inliers", "network_weights", "point_track_indices", "points", "point_parts")
+    __slots__ = ("weights", "inliers", "network_weights", "point_track_indices", "points", "point_parts", "second_structures")
     WEIGHTS_FIELD_NUMBER: _ClassVar[int]
     INLIERS_FIELD_NUMBER: _ClassVar[int]
     NETWORK_WEIGHTS_FIELD_NUMBER: _ClassVar[int]
     POINT_TRACK_INDICES_FIELD_NUMBER: _ClassVar[int]
     POINTS_FIELD_NUMBER: _ClassVar[int]
     POINT_PARTS_FIELD_NUMBER: _ClassVar[int]
+    SECOND_STRUCTURES_FIELD_NUMBER: _ClassVar[int]
     weights: _containers.RepeatedScalarFieldContainer[float]
     inliers: _containers.RepeatedScalarFieldContainer[bool]
     network_weights: _containers.RepeatedScalarFieldContainer[float]
     point_track_indices: _containers.RepeatedScalarFieldContainer[int]
     points: _containers.RepeatedScalarFieldContainer[float]
     point_parts: _containers.RepeatedScalarFieldContainer[int]
-    def __init__(self, weights: _Optional[_Iterable[float]] = ..., inliers: _Optional[_Iterable[bool]] = ..., network_weights: _Optional[_Iterable[float]] = ..., point_track_indices: _Optional[_Iterable[int]] = ..., points: _Optional[_Iterable[float]] = ..., point_parts: _Optional[_Iterable[int]] = ...) -> None: ...
+    second_structures: _containers.RepeatedScalarFieldContainer[bool]
+    def __init__(self, weights: _Optional[_Iterable[float]] = ..., inliers: _Optional[_Iterable[bool]] = ..., network_weights: _Optional[_Iterable[float]] = ..., point_track_indices: _Optional[_Iterable[int]] = ..., points: _Optional[_Iterable[float]] = ..., point_parts: _Optional[_Iterable[int]] = ..., second_structures: _Optional[_Iterable[bool]] = ...) -> None: ...
 
 class ObservationResults(_message.Message):
     __slots__ = ("inliers", "judged", "residuals_px", "weights", "split_numbers")

@@ -86,6 +86,9 @@ impl Duplicates {
             if !tracks.part.is_empty() {
                 tracks.part[duplicate] = tracks.part[first];
             }
+            if !tracks.second_structure.is_empty() {
+                tracks.second_structure[duplicate] = tracks.second_structure[first];
+            }
             let observations = &mut solution.observations;
             for (k, like) in ranges[duplicate].clone().zip(ranges[first].clone()) {
                 let (k, like) = (input.caller_index(k), input.caller_index(like));

@@ -150,6 +150,26 @@ impl Input {
         Self { joining: Some(joining), ..self }
     }
 
+    /// The input of the observations `keeps` says so of, in sorted order; views and tracks keep their indices.
+    ///
+    /// * `keeps`: of an observation's place in sorted order
+    pub fn only(&self, keeps: impl Fn(usize) -> bool) -> Self {
+        let kept: Vec<usize> = (0..self.observation_count()).filter(|&k| keeps(k)).collect();
+        let pick = |values: &[f64]| kept.iter().map(|&k| values[k]).collect::<Vec<f64>>();
+        Self {
+            views: self.views.clone(),
+            track_count: self.track_count,
+            view: kept.iter().map(|&k| self.view[k]).collect(),
+            track: kept.iter().map(|&k| self.track[k]).collect(),
+            x: pick(&self.x),
+            y: pick(&self.y),
+            depth: self.depth.as_deref().map(pick),
+            sigma: self.sigma.as_deref().map(pick),
+            caller_order: (0..kept.len() as u32).collect(),
+            joining: None,
+        }
+    }
+
     /// Observations and keypoints of an input that was joined from matches, in the caller's order; `None` for others.
     pub fn joined_tracks(&self) -> Option<JoinedTracks> {
         let joining = self.joining.clone()?;

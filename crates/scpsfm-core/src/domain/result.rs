@@ -240,6 +240,8 @@ pub struct TrackResults {
     pub point: Vec<Option<[f64; 3]>>,
     /// Reconstruction in whose frame each track's point is, see [`ViewResult::part`]; empty: all are in that of part 0.
     pub part: Vec<u32>,
+    /// Whether each track agrees with the rigid motion that `SECOND_STRUCTURE` tells of; empty where it tells of none.
+    pub second_structure: Vec<bool>,
 }
 
 impl TrackResults {

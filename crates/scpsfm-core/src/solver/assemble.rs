@@ -11,9 +11,10 @@ use super::portfolio::Found;
 use super::problem::{Problem, camera_groups};
 use super::reconstruction::{Reconstruction, own_verdicts};
 use super::recorder::Recorder;
+use super::second_structures::{self, SecondStructure};
 use super::sequence::Ended;
 use super::view_selection::{LEAST_SHARED_BY_PAIR, LEAST_VIEWS};
-use super::{second_structures, static_tracks};
+use super::{Error, static_tracks};
 use crate::domain::result::{ObservationResults, Sigmas, TrackResults, TrackSplit, ViewResult};
 use crate::domain::{Calibration, Grade, Solution, Stage, Status, Warning, WarningCode};
 use crate::geometry::bundle::metric::{Intrinsics, Parameter};
@@ -26,20 +27,60 @@ use crate::geometry::{Camera, Point};
 const LEAST_OBSERVATIONS: usize = 2;
 
 /// The solution that the best of what was found gives; without any, the reason.
-pub fn solution(ended: Ended, problem: &Problem, mut recorder: Recorder) -> Solution {
+///
+/// # Errors
+/// [`Error::Stopped`]; [`Error::Internal`] for defects.
+pub fn solution(ended: Ended, problem: &Problem, mut recorder: Recorder) -> Result<Solution, Error> {
     let mut warnings = problem.warnings.clone();
-    let (reconstruction, mut seed) = match ended {
-        Ended::Extended(extended) => (Some(Reconstruction::of_extended(problem, &extended)), Some(extended.seed)),
-        Ended::Block(Some(attempt)) => (Reconstruction::of_attempt(problem, &attempt), Some(*attempt)),
-        Ended::Block(None) => (None, None),
+    let mut first = match Assembled::of(ended, problem, &mut recorder) {
+        Ok(first) => first,
+        Err(seed) => {
+            warnings.push(why_unsolved(problem, seed.as_deref()));
+            return Ok(unsolved(problem, seed.as_deref(), warnings, recorder));
+        }
     };
-    let (Some(reconstruction), Some(seed)) = (reconstruction, &mut seed) else {
-        warnings.push(why_unsolved(problem, seed.as_ref()));
-        return unsolved(problem, seed.as_ref(), warnings, recorder);
+    let second = match problem.is_searched() {
+        true => second_structures::find(problem, &first.reconstruction.geometry, &first.judged, first.evidence)?,
+        false => None,
     };
-    recorder.enter(Stage::Judge);
-    let judged = seed.judged.take().unwrap_or_else(|| reconstruction.judged(problem, seed, &mut recorder));
-    reconstruction.solution(problem, seed, judged, warnings, recorder)
+    if let Some(SecondStructure { mut tracks, scene }) = second {
+        if let Some(Ok(scene)) = scene.map(|ended| Assembled::of(ended, problem, &mut recorder)) {
+            tracks = std::mem::replace(&mut first, scene).judged.tracks.inlier;
+        }
+        warnings.push(second_structures::warning(&tracks, &first.judged.tracks.inlier));
+        first.judged.tracks.second_structure = tracks;
+    }
+    let Assembled { reconstruction, seed, judged, .. } = first;
+    Ok(reconstruction.solution(problem, &seed, judged, warnings, recorder))
+}
+
+/// A reconstruction and what it says of every track and observation.
+struct Assembled {
+    reconstruction: Reconstruction,
+    seed: Attempt,
+    judged: Judged,
+    evidence: f64,
+}
+
+impl Assembled {
+    /// Of what was found, judged where that was not done already; the seed of one without a reconstruction.
+    fn of(ended: Ended, problem: &Problem, recorder: &mut Recorder) -> Result<Self, Option<Box<Attempt>>> {
+        let evidence = ended.evidence(problem);
+        let (reconstruction, seed) = match ended {
+            Ended::Extended(extended) => {
+                (Some(Reconstruction::of_extended(problem, &extended)), Some(Box::new(extended.seed)))
+            }
+            Ended::Block(Some(attempt)) => (Reconstruction::of_attempt(problem, &attempt), Some(attempt)),
+            Ended::Block(None) => (None, None),
+        };
+        let (reconstruction, mut seed) = match (reconstruction, seed) {
+            (Some(reconstruction), Some(seed)) => (reconstruction, seed),
+            (_, seed) => return Err(seed),
+        };
+        recorder.enter(Stage::Judge);
+        let judged = seed.judged.take().unwrap_or_else(|| reconstruction.judged(problem, &seed, recorder));
+        Ok(Self { reconstruction, seed: *seed, judged, evidence })
+    }
 }
 
 impl Reconstruction {
@@ -60,7 +101,6 @@ impl Reconstruction {
         recorder: Recorder,
     ) -> Solution {
         warnings.extend(self.warnings.iter().cloned());
-        warnings.extend(second_structures::warning(&seed.second_structure, &judged.tracks.inlier));
         warnings.extend(static_tracks::warning(problem, &judged.tracks.inlier));
         let inliers = judged.tracks.inlier.iter().filter(|&&inlier| inlier).count();
         // Depths verify fewer, and PAPER, SCPSFM and PSFM keep what they keep.

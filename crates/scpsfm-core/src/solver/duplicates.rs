@@ -6,44 +6,26 @@
 use super::Error;
 use crate::domain::duplicates::Duplicates;
 use crate::domain::result::ObservationResults;
-use crate::domain::{Input, Limits, Observer, Progress, RawInput, Solution, Stage};
+use crate::domain::{Input, Observer, Progress, Solution, Stage};
 
 /// Solves the input without its duplicates, by `solve`, and answers for all of it.
 ///
 /// # Errors
-/// Those of `solve`; [`Error::Internal`] where the rest is no valid input, which it is.
+/// Those of `solve`.
 pub fn solve_once(
     input: &Input,
     duplicates: &Duplicates,
     observer: &mut dyn Observer,
     solve: impl FnOnce(&Input, &mut dyn Observer) -> Result<Solution, Error>,
 ) -> Result<Solution, Error> {
-    let (rest, places) = without(input, duplicates)?;
+    let is_kept = |k: &usize| !duplicates.is_duplicate(input.track_of(*k));
+    let rest = input.only(|k| is_kept(&k));
+    let places: Vec<usize> = (0..input.observation_count()).filter(is_kept).map(|k| input.caller_index(k)).collect();
     let mut solution = solve(&rest, &mut Unfolding { observer, duplicates })?;
     unfold(&mut solution, input.observation_count(), &places);
     duplicates.answer(input, &mut solution);
     solution.warnings.push(duplicates.warning(|track| track.to_string()));
     Ok(solution)
-}
-
-/// The input without the observations of its duplicates, whose tracks are empty then; and where each observation that
-/// is left stood in the caller's order.
-fn without(input: &Input, duplicates: &Duplicates) -> Result<(Input, Vec<usize>), Error> {
-    let kept: Vec<usize> =
-        (0..input.observation_count()).filter(|&k| !duplicates.is_duplicate(input.track_of(k))).collect();
-    let raw = RawInput {
-        views: input.views().to_vec(),
-        track_count: input.track_count(),
-        view: kept.iter().map(|&k| input.view_of(k) as u32).collect(),
-        track: kept.iter().map(|&k| input.track_of(k) as u32).collect(),
-        x: kept.iter().map(|&k| input.point_px(k)[0]).collect(),
-        y: kept.iter().map(|&k| input.point_px(k)[1]).collect(),
-        depth: kept.iter().filter_map(|&k| input.depth(k)).collect(),
-        sigma: kept.iter().filter_map(|&k| input.sigma_px(k)).collect(),
-    };
-    let limits = Limits { max_views: usize::MAX, max_tracks: usize::MAX, max_observations: usize::MAX };
-    let rest = Input::new(raw, &limits, "input").map_err(|error| Error::Internal(error.to_string()))?;
-    Ok((rest, kept.into_iter().map(|k| input.caller_index(k)).collect()))
 }
 
 /// Puts what is said of the observations that were solved where the caller has them; nothing is said of the others yet.

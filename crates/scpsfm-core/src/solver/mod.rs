@@ -141,7 +141,7 @@ fn solve_views(
         false => Ended::Block(baselines::solve(&problem, &mut recorder)?.map(Box::new)),
     };
     problem.stopped()?;
-    let solution = assemble::solution(ended, &problem, recorder);
+    let solution = assemble::solution(ended, &problem, recorder)?;
     problem.stopped()?;
     Ok(solution)
 }

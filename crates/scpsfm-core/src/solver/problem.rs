@@ -105,8 +105,24 @@ impl Undone {
 
 impl<'a> Problem<'a> {
     pub fn new(input: &'a Input, settings: &'a SolveSettings, threads: Threads, stop: &'a StopToken) -> Self {
+        let (normalization, warnings) = normalization(input);
+        Self::normalized(input, normalization, warnings, settings, threads, stop)
+    }
+
+    /// The problem of some of the observations, normalised as all are.
+    pub fn of_some<'b>(&'b self, input: &'b Input, settings: &'b SolveSettings) -> Problem<'b> {
+        Problem::normalized(input, self.normalization.clone(), Vec::new(), settings, self.threads, self.stop)
+    }
+
+    fn normalized(
+        input: &'a Input,
+        normalization: Normalization,
+        mut warnings: Vec<Warning>,
+        settings: &'a SolveSettings,
+        threads: Threads,
+        stop: &'a StopToken,
+    ) -> Self {
         let ranges = input.track_ranges();
-        let (normalization, mut warnings) = normalization(input);
         let has_groups = is_searched(settings) && !settings.focal_per_view;
         warnings.extend(merged_cameras(input, has_groups, settings.focal_per_view));
         let mut of_view = vec![Vec::new(); input.view_count()];

@@ -17,7 +17,7 @@ use super::portfolio::{self, Found, Portfolio, VerifiedBy};
 use super::problem::Problem;
 use super::recorder::Recorder;
 use super::sequence::ProjectiveReconstruction;
-use super::{Error, all_tracks, near_duplicates, scpsfm, second_structures, static_tracks, track_sampling};
+use super::{Error, all_tracks, near_duplicates, scpsfm, static_tracks, track_sampling};
 use crate::domain::{FocalPrior, Grade, Method, Stage, WarningCode};
 use crate::geometry::bundle::metric::{Intrinsics, MetricReconstruction};
 use crate::geometry::statistics::median;
@@ -51,8 +51,6 @@ pub struct Attempt {
     /// Every track and observation judged by it, where that was done already.
     pub judged: Option<Judged>,
     pub calibration: Option<Outcome>,
-    /// Tracks of the input that the search left out and that agree on a motion of their own.
-    pub second_structure: Vec<usize>,
     /// Probability of tracks to be right by image points and depths together; `None` where depths say nothing more.
     pub weights_by_depths: Option<TrackWeights>,
     /// The method's own verdicts where it searches nothing (PAPER, SCPSFM, PSFM).
@@ -68,7 +66,6 @@ impl Attempt {
             projective: None,
             judged: None,
             calibration: None,
-            second_structure: Vec::new(),
             weights_by_depths: None,
             decided: None,
         }
@@ -328,9 +325,6 @@ fn search(
     if ln_false_alarms >= FalseAlarmOptions::DEFAULT.ln_acceptable {
         return Ok(attempt);
     }
-    let second = second_structures::find(complete, &refined, problem.stop).unwrap_or_default();
-    attempt.second_structure = second.into_iter().map(|track| tracks[track]).collect();
-    problem.stopped()?;
     if effort.is_seed {
         attempt.found.consensus = Some(refined);
         return Ok(attempt);

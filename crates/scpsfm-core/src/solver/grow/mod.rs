@@ -94,7 +94,7 @@ pub fn judge(block: &CompleteBlock, cameras: Vec<Camera>, noise: f64, stop: &Sto
 ///
 /// Growing and polishing come back to a support that stands still several times each: with 100 right tracks in 11
 /// views, 37 adjustments become 11.
-pub struct Fits<'a> {
+struct Fits<'a> {
     block: &'a CompleteBlock,
     noise: f64,
     stop: &'a StopToken,

@@ -36,6 +36,7 @@ pub use projective::ProjectiveReconstruction;
 pub use structure::component_of_track;
 
 use super::attempt::{self, Attempt, Effort};
+use super::block::Block;
 use super::grow::LEAST_INLIERS;
 use super::learned::TrackScoreOptions;
 use super::problem::Problem;
@@ -110,8 +111,7 @@ fn of_blocks(problem: &Problem, recorder: &mut Recorder) -> Result<Ended, Error>
     let mut best = by_projective_extension(problem, None, starts(first, !is_quick, cheap), recorder)?;
     let leaves_most = |best: &Attempt| !best.is_good() && best.leaves_most_views(problem);
     if !blocks.is_whole && metric.is_none() && best.as_ref().is_none_or(leaves_most) {
-        let triplets = view_selection::triplets(problem, &vec![true; problem.views()]);
-        let starts = triplets.into_iter().map(|views| Start::Views(SeedViews::Triplet(views))).collect();
+        let starts = all_triplets(problem).into_iter().map(Start::Views).collect();
         best = by_projective_extension(problem, best, starts, recorder)?;
     }
     if is_quick && metric.is_none() && !stands(&best) {
@@ -132,6 +132,52 @@ fn of_blocks(problem: &Problem, recorder: &mut Recorder) -> Result<Ended, Error>
         (_, Some(metric)) => Ended::Extended(metric),
         (found, None) => found.unwrap_or(Ended::Block(None)),
     })
+}
+
+/// The first projective reconstruction that a quick search leads to, without a calibration: of blocks, then of triplets;
+/// `None` where nothing stands.
+///
+/// * `is_promising`: which blocks are worth a search
+///
+/// # Errors
+/// As [`solve`].
+pub fn reconstruct_quickly(
+    problem: &Problem,
+    is_promising: impl Fn(&Block) -> bool,
+    recorder: &mut Recorder,
+) -> Result<Option<ProjectiveReconstruction>, Error> {
+    let blocks = Blocks::of(problem);
+    let triplets = if blocks.is_whole { Vec::new() } else { all_triplets(problem) };
+    let promising = blocks.sets.into_iter().filter(|views| is_promising(&problem.block(views))).map(SeedViews::Block);
+    let mut pairs = triplets::Pairs::new(problem);
+    for views in promising.chain(triplets) {
+        problem.stopped()?;
+        let mut attempt = begin(problem, &views, &mut pairs, recorder)?;
+        extend_projectively(problem, &mut attempt, false, recorder)?;
+        if attempt.projective.is_some() {
+            return Ok(attempt.projective);
+        }
+    }
+    Ok(None)
+}
+
+/// Triplets of all views.
+fn all_triplets(problem: &Problem) -> Vec<SeedViews> {
+    let triplets = view_selection::triplets(problem, &vec![true; problem.views()]);
+    triplets.into_iter().map(SeedViews::Triplet).collect()
+}
+
+/// What a quick search finds of views that a reconstruction may begin with.
+fn begin(
+    problem: &Problem,
+    views: &SeedViews,
+    pairs: &mut triplets::Pairs,
+    recorder: &mut Recorder,
+) -> Result<Attempt, Error> {
+    match views {
+        SeedViews::Block(views) => attempt::search_block(problem, problem.block(views), QUICK_SEED, recorder),
+        SeedViews::Triplet(views) => pairs.attempt(views, recorder),
+    }
 }
 
 impl Ended {
@@ -155,7 +201,7 @@ impl Ended {
     }
 
     /// How well the observations fit, see [`projective::evidence`].
-    fn evidence(&self, problem: &Problem) -> f64 {
+    pub fn evidence(&self, problem: &Problem) -> f64 {
         match self {
             Ended::Extended(extended) => extended.evidence(problem),
             Ended::Block(attempt) => attempt.as_ref().map_or(0.0, |attempt| attempt.evidence(problem)),
@@ -309,13 +355,7 @@ fn by_projective_extension(
             Start::Found { attempt, keeps } => (*attempt, keeps),
             Start::Views(views) => {
                 recorder.begin_block(k, count);
-                let attempt = match views {
-                    SeedViews::Block(views) => {
-                        attempt::search_block(problem, problem.block(&views), QUICK_SEED, recorder)?
-                    }
-                    SeedViews::Triplet(views) => pairs.attempt(&views, recorder)?,
-                };
-                (attempt, false)
+                (begin(problem, &views, &mut pairs, recorder)?, false)
             }
         };
         extend_projectively(problem, &mut attempt, keeps, recorder)?;

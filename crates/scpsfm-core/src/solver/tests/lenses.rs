@@ -77,18 +77,6 @@ fn a_distorting_lens_is_estimated_and_everything_reprojects_through_it() {
     }
 }
 
-/// Pinholes fit a part of what a strong lens shows, and another part moves alike until the lens is known.
-#[test]
-fn tracks_that_a_lens_brings_in_are_no_second_structure() {
-    for seed in [11, 13] {
-        let options = SceneOptions { noise: 0.0005, outliers: 0.0, radial_k1: -0.3, seed, ..SceneOptions::default() };
-        let solution = solved(&scene(options).0, &SolveSettings::default());
-        println!("seed {seed}: {} inliers, {:?}", solution.inlier_track_count(), solution.warnings);
-        assert_eq!(solution.inlier_track_count(), 200, "seed {seed}");
-        assert!(solution.warnings.iter().all(|warning| warning.code != WarningCode::SecondStructure), "seed {seed}");
-    }
-}
-
 #[test]
 fn a_zoom_gets_a_focal_length_a_view() {
     let options = SceneOptions { noise: 0.001, outliers: 0.5, tracks: 100, seed: 4, ..SceneOptions::default() };

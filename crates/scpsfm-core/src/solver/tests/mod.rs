@@ -6,6 +6,7 @@ mod learned;
 mod lenses;
 mod observations;
 mod scpsfm;
+mod second_structures;
 mod sequences;
 mod special_scenes;
 mod triplets;
@@ -112,23 +113,6 @@ fn strong_noise_is_judged_by_depths_too() {
         }
     }
     assert!(by_depths > 0.9 && by_depths > by_image, "mean F1 {by_depths} with depths, {by_image} without");
-}
-
-#[test]
-fn a_second_motion_is_told_and_nothing_else_is() {
-    for with_depths in [false, true] {
-        for seed in 0..3 {
-            for second_motion in [0.0, 0.3] {
-                let options =
-                    SceneOptions { outliers: 0.5, second_motion, with_depths, seed, ..SceneOptions::default() };
-                let (input, scene) = scene(options);
-                let solution = solved(&input, &SolveSettings { method: Method::Geometry, ..SolveSettings::default() });
-                let told = solution.warnings.iter().any(|warning| warning.code == WarningCode::SecondStructure);
-                assert_eq!(told, second_motion > 0.0, "seed {seed}, depths {with_depths}: {:?}", solution.warnings);
-                assert!(agreement(&solution.tracks.inlier, &scene.truth.inlier).f1 > 0.98, "no blend, seed {seed}");
-            }
-        }
-    }
 }
 
 #[test]
