@@ -25,6 +25,8 @@ options! {
         /// blocks should have, which perspective bends more than so few tell, a search takes some milliseconds; of 190
         /// wrong ones five times as long as the rest of an easy solve.
         asked_tracks: usize = ViewSelectionOptions::DEFAULT.wanted_tracks,
+        /// Triplets that are tried. Of wrong matches each takes a tenth of a second.
+        most_triplets: usize = 2,
     }
 }
 
@@ -65,7 +67,8 @@ pub fn find(
     let is_promising = |block: &Block| is_promising(&near_duplicates::without(&rest, block.clone()), rest.stop);
     let mut silent = Silent;
     let mut recorder = Recorder::new(&mut silent, rest.observed_views().len());
-    let Some(second) = sequence::reconstruct_quickly(&rest, is_promising, &mut recorder)? else { return Ok(None) };
+    let second = sequence::reconstruct_quickly(&rest, is_promising, OPTIONS.most_triplets, &mut recorder)?;
+    let Some(second) = second else { return Ok(None) };
     let evidence_of_second = second.evidence(problem.outlier_density);
     if evidence_of_second < OPTIONS.least_share * evidence {
         return Ok(None);

@@ -42,7 +42,7 @@ use super::learned::TrackScoreOptions;
 use super::problem::Problem;
 use super::reconstruction::Reconstruction;
 use super::recorder::Recorder;
-use super::view_selection::SeedViews;
+use super::view_selection::{SeedViews, ViewSelectionOptions};
 use super::{Error, view_selection};
 use crate::domain::Stage;
 use extended::extend;
@@ -134,23 +134,27 @@ fn of_blocks(problem: &Problem, recorder: &mut Recorder) -> Result<Ended, Error>
     })
 }
 
-/// The first projective reconstruction that a quick search leads to, without a calibration: of blocks, then of triplets;
-/// `None` where nothing stands.
+/// The first projective reconstruction that a quick search leads to, without a calibration: of blocks, and where these
+/// have fewer tracks than they should, of triplets; `None` where nothing stands.
 ///
 /// * `is_promising`: which blocks are worth a search
+/// * `most_triplets`: that are tried
 ///
 /// # Errors
 /// As [`solve`].
 pub fn reconstruct_quickly(
     problem: &Problem,
     is_promising: impl Fn(&Block) -> bool,
+    most_triplets: usize,
     recorder: &mut Recorder,
 ) -> Result<Option<ProjectiveReconstruction>, Error> {
-    let blocks = Blocks::of(problem);
-    let triplets = if blocks.is_whole { Vec::new() } else { all_triplets(problem) };
-    let promising = blocks.sets.into_iter().filter(|views| is_promising(&problem.block(views))).map(SeedViews::Block);
+    let blocks = Blocks::of(problem).sets;
+    let is_sparse =
+        |views: &Vec<usize>| problem.block(views).tracks.len() < ViewSelectionOptions::DEFAULT.wanted_tracks;
+    let triplets = if blocks.iter().all(is_sparse) { all_triplets(problem) } else { Vec::new() };
+    let promising = blocks.into_iter().filter(|views| is_promising(&problem.block(views))).map(SeedViews::Block);
     let mut pairs = triplets::Pairs::new(problem);
-    for views in promising.chain(triplets) {
+    for views in promising.chain(triplets.into_iter().take(most_triplets)) {
         problem.stopped()?;
         let mut attempt = begin(problem, &views, &mut pairs, recorder)?;
         extend_projectively(problem, &mut attempt, false, recorder)?;
