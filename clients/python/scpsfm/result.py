@@ -296,7 +296,7 @@ class TrackResults:
     """What a network says of the track by itself, 0 to 1; `None`: none ran. (tracks,)."""
 
     second_structure: NDArray[np.bool_]
-    """Whether the track, no inlier, agrees with the motion that `SECOND_STRUCTURE` tells of. (tracks,)."""
+    """True for rejected tracks that agree with the motion that `SECOND_STRUCTURE` reports. (tracks,)."""
 
     points: Floats
     """X, Y, Z of each track; NaN where it has no point. (tracks, 3)."""
@@ -585,7 +585,7 @@ class Result:
             weight=_row(message.weights, np.float32, count, "weights of tracks"),
             inlier=inlier,
             network_weight=_row(network, np.float32, count, "weights of a network") if network else None,
-            second_structure=_row(second or [False] * count, np.bool_, count, "tracks of a second structure"),
+            second_structure=_row(second or np.zeros(count), np.bool_, count, "tracks of a second structure"),
             points=points,
             part=part,
         )

@@ -178,6 +178,7 @@ fn a_malformed_answer_names_its_field() {
         change(result.tracks.as_mut().expect("set"));
     };
     assert_eq!(with(&|result| tracks(result, &|tracks| tracks.inliers.truncate(1))), "tracks");
+    assert_eq!(with(&|result| tracks(result, &|tracks| tracks.second_structures.truncate(1))), "tracks");
     assert_eq!(
         with(&|result| tracks(result, &|tracks| tracks.point_track_indices[0] = 3)),
         "tracks.point_track_indices[0]"

@@ -150,10 +150,11 @@ impl Input {
         Self { joining: Some(joining), ..self }
     }
 
-    /// The input of the observations `keeps` says so of, in sorted order; views and tracks keep their indices.
+    /// The input restricted to the observations for which `keeps` is true. Views and tracks keep their indices, also
+    /// where nothing is left of them; [`Self::caller_index`] counts the kept observations in sorted order.
     ///
     /// * `keeps`: of an observation's place in sorted order
-    pub fn only(&self, keeps: impl Fn(usize) -> bool) -> Self {
+    pub fn restricted_to(&self, keeps: impl Fn(usize) -> bool) -> Self {
         let kept: Vec<usize> = (0..self.observation_count()).filter(|&k| keeps(k)).collect();
         let pick = |values: &[f64]| kept.iter().map(|&k| values[k]).collect::<Vec<f64>>();
         Self {
@@ -466,6 +467,20 @@ pub(super) mod tests {
         assert_eq!((0..4).map(|k| input.caller_index(k)).collect::<Vec<_>>(), [2, 3, 1, 0]);
         let back = input.to_raw();
         assert_eq!((back.view, back.track, back.x), (raw().view, raw().track, raw().x));
+    }
+
+    #[test]
+    fn a_restricted_input_keeps_indices_and_all_that_is_known_of_an_observation() {
+        let all = RawInput { depth: vec![4.0, 3.0, 1.0, 2.0], sigma: vec![0.4, 0.3, 0.1, 0.2], ..raw() };
+        let input = Input::new(all, &Limits::default(), "track_set").expect("valid");
+        let rest = input.restricted_to(|k| k != 1);
+        assert_eq!((rest.view_count(), rest.track_count(), rest.observation_count()), (2, 2, 3));
+        let seen = |input: &Input, k: usize| {
+            (input.view_of(k), input.track_of(k), input.point_px(k), input.depth(k), input.sigma_px(k))
+        };
+        let of_all = [0, 2, 3].map(|k| seen(&input, k));
+        assert_eq!([0, 1, 2].map(|k| seen(&rest, k)), of_all);
+        assert_eq!((rest.track_ranges(), rest.caller_index(2)), (vec![0, 1, 3], 2));
     }
 
     #[test]

@@ -240,7 +240,7 @@ pub struct TrackResults {
     pub point: Vec<Option<[f64; 3]>>,
     /// Reconstruction in whose frame each track's point is, see [`ViewResult::part`]; empty: all are in that of part 0.
     pub part: Vec<u32>,
-    /// Whether each track agrees with the rigid motion that `SECOND_STRUCTURE` tells of; empty where it tells of none.
+    /// Whether each track, rejected, agrees with the rigid motion that `SECOND_STRUCTURE` reports; empty where none is.
     pub second_structure: Vec<bool>,
 }
 

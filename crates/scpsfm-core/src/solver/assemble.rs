@@ -1,4 +1,5 @@
-//! From what the stages found to the solution that callers read.
+//! From what the stages found to the solution that callers read. Here it is decided which of two structures is the
+//! result.
 
 use nalgebra::{Matrix3, Matrix4};
 
@@ -34,7 +35,7 @@ pub fn solution(ended: Ended, problem: &Problem, mut recorder: Recorder) -> Resu
     let mut warnings = problem.warnings.clone();
     let mut first = match Assembled::of(ended, problem, &mut recorder) {
         Ok(first) => first,
-        Err(seed) => {
+        Err(Unsolved { seed }) => {
             warnings.push(why_unsolved(problem, seed.as_deref()));
             return Ok(unsolved(problem, seed.as_deref(), warnings, recorder));
         }
@@ -43,15 +44,15 @@ pub fn solution(ended: Ended, problem: &Problem, mut recorder: Recorder) -> Resu
         true => second_structures::find(problem, &first.reconstruction.geometry, &first.judged, first.evidence)?,
         false => None,
     };
-    if let Some(SecondStructure { mut tracks, scene }) = second {
-        if let Some(Ok(scene)) = scene.map(|ended| Assembled::of(ended, problem, &mut recorder)) {
-            tracks = std::mem::replace(&mut first, scene).judged.tracks.inlier;
+    let second = second.map(|SecondStructure { tracks, rival }| {
+        let rival = rival.and_then(|ended| Assembled::of(ended, problem, &mut recorder).ok());
+        match rival.filter(|rival| rival.may_replace(&first)) {
+            Some(rival) => std::mem::replace(&mut first, rival).judged.tracks.inlier,
+            None => tracks,
         }
-        warnings.push(second_structures::warning(&tracks, &first.judged.tracks.inlier));
-        first.judged.tracks.second_structure = tracks;
-    }
+    });
     let Assembled { reconstruction, seed, judged, .. } = first;
-    Ok(reconstruction.solution(problem, &seed, judged, warnings, recorder))
+    Ok(reconstruction.solution(problem, &seed, judged, second, warnings, recorder))
 }
 
 /// A reconstruction and what it says of every track and observation.
@@ -62,9 +63,15 @@ struct Assembled {
     evidence: f64,
 }
 
+/// Nothing stands.
+struct Unsolved {
+    /// What came nearest to it.
+    seed: Option<Box<Attempt>>,
+}
+
 impl Assembled {
-    /// Of what was found, judged where that was not done already; the seed of one without a reconstruction.
-    fn of(ended: Ended, problem: &Problem, recorder: &mut Recorder) -> Result<Self, Option<Box<Attempt>>> {
+    /// Assembles what was found, and judges every track by it where that was not done already.
+    fn of(ended: Ended, problem: &Problem, recorder: &mut Recorder) -> Result<Self, Unsolved> {
         let evidence = ended.evidence(problem);
         let (reconstruction, seed) = match ended {
             Ended::Extended(extended) => {
@@ -75,11 +82,19 @@ impl Assembled {
         };
         let (reconstruction, mut seed) = match (reconstruction, seed) {
             (Some(reconstruction), Some(seed)) => (reconstruction, seed),
-            (_, seed) => return Err(seed),
+            (_, seed) => return Err(Unsolved { seed }),
         };
         recorder.enter(Stage::Judge);
         let judged = seed.judged.take().unwrap_or_else(|| reconstruction.judged(problem, &seed, recorder));
         Ok(Self { reconstruction, seed: *seed, judged, evidence })
+    }
+
+    /// Whether it may be the result in place of one that it explains more than: where it is verified, not of static
+    /// tracks, and graded no worse. A calibration is of the camera, whatever moved before it.
+    fn may_replace(&self, other: &Self) -> bool {
+        let inliers = self.judged.tracks.inlier.iter().filter(|&&inlier| inlier).count();
+        let [own, grade] = [self, other].map(|one| one.reconstruction.grade);
+        inliers >= LEAST_INLIERS && !self.reconstruction.geometry.of_static && own.worse(grade) == grade
     }
 }
 
@@ -90,6 +105,8 @@ impl Reconstruction {
 
     /// Writes down what it and the judged tracks say.
     ///
+    /// * `second`: tracks of a second structure
+    ///
     /// With grade PROJECTIVE_ONLY nothing metric is in it, the focal length included: a number that must not be used
     /// is not given; points are then in the frame of the projective cameras.
     fn solution(
@@ -97,11 +114,11 @@ impl Reconstruction {
         problem: &Problem,
         seed: &Attempt,
         mut judged: Judged,
+        second: Option<Vec<bool>>,
         mut warnings: Vec<Warning>,
         recorder: Recorder,
     ) -> Solution {
         warnings.extend(self.warnings.iter().cloned());
-        warnings.extend(static_tracks::warning(problem, &judged.tracks.inlier));
         let inliers = judged.tracks.inlier.iter().filter(|&&inlier| inlier).count();
         // Depths verify fewer, and PAPER, SCPSFM and PSFM keep what they keep.
         if seed.judges_observations() && inliers < LEAST_INLIERS {
@@ -109,6 +126,8 @@ impl Reconstruction {
             warnings.push(Warning::new(WarningCode::FewInliers, detail));
             return nothing(problem, Some(seed), warnings, recorder);
         }
+        warnings.extend(second.and_then(|second| second_structures::mark(problem, &second, &mut judged.tracks)));
+        warnings.extend(static_tracks::warning(problem, &judged.tracks.inlier));
         let frames = self.frames(problem);
         let backs: Vec<Option<Matrix4<f64>>> =
             frames.iter().map(|frame| frame.filter(|_| !self.is_metric())?.try_inverse()).collect();

@@ -19,7 +19,7 @@ pub fn solve_once(
     solve: impl FnOnce(&Input, &mut dyn Observer) -> Result<Solution, Error>,
 ) -> Result<Solution, Error> {
     let is_kept = |k: &usize| !duplicates.is_duplicate(input.track_of(*k));
-    let rest = input.only(|k| is_kept(&k));
+    let rest = input.restricted_to(|k| is_kept(&k));
     let places: Vec<usize> = (0..input.observation_count()).filter(is_kept).map(|k| input.caller_index(k)).collect();
     let mut solution = solve(&rest, &mut Unfolding { observer, duplicates })?;
     unfold(&mut solution, input.observation_count(), &places);

@@ -9,7 +9,7 @@
 //! [`all_tracks`] join; [`depths`] where those verify what image points cannot), [`scpsfm`] or [`baselines`], and
 //! [`calibration`] upgrades it. [`sequence`] tries blocks in order of cost and extends what stands to the other views
 //! and tracks, projectively or metrically, observation by observation; [`assemble`] has [`classification`] judge every
-//! track and observation, and writes it down.
+//! track and observation, has [`second_structures`] search what is left out, and writes it down.
 
 pub(crate) mod a_contrario;
 mod all_tracks;
@@ -88,7 +88,8 @@ pub fn solve(
 ///
 /// Deterministic: the same input, settings and build give the same solution, but for times, on any number of threads.
 /// Further ones than the caller's help where a reconstruction is extended and tracks are judged.
-/// `observer` is told of every iteration; `stop` is asked at least every 50 ms or network iteration.
+/// `observer` is told of every iteration, but not of those that look for a second structure; `stop` is asked at least
+/// every 50 ms or network iteration.
 ///
 /// AUTO and GEOMETRY judge every observation by itself, but where depths alone verify, and extend a block to every view
 /// that can be registered: all views at once where their tracks are complete and that decides quickly, else few of

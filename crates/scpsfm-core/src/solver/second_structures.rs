@@ -7,9 +7,10 @@ use super::grow::{self, LEAST_INLIERS, LEAST_SUPPORT};
 use super::problem::{Problem, Undone, VERIFIED};
 use super::recorder::Recorder;
 use super::search::affine::AffineSearch;
-use super::sequence::{self, Ended};
+use super::sequence::{self, Ended, ProjectiveReconstruction};
 use super::view_selection::ViewSelectionOptions;
 use super::{near_duplicates, priors};
+use crate::domain::result::TrackResults;
 use crate::domain::{Method, Silent, SolveSettings, StopToken, Warning, WarningCode};
 
 options! {
@@ -19,25 +20,27 @@ options! {
         /// of noise.
         far_gates: f64 = 16.0,
         /// Evidence, at least, as a share of that of the reconstruction. Of 280 photographed scenes, drifting tracks of
-        /// four had .01 to .03 in a few views; 27 of 31 second bodies had .07 and more.
+        /// four had .01 to .03 in a few views; of 31 second bodies 27 had .07 and more, one .01, and three none.
         least_share: f64 = 0.05,
-        /// Tracks of a block from which affine cameras are asked first whether it is worth searching. Of fewer than
-        /// blocks should have, which perspective bends more than so few tell, a search takes some milliseconds; of 190
-        /// wrong ones five times as long as the rest of an easy solve.
-        asked_tracks: usize = ViewSelectionOptions::DEFAULT.wanted_tracks,
-        /// Triplets that are tried. Of wrong matches each takes a tenth of a second.
+        /// Tracks of a block from which it is searched only where more than four of them fit affine cameras. In smaller
+        /// blocks perspective hides that, and their search takes 10 to 20 ms; that of 190 wrong tracks took five times
+        /// as long as the rest of an easy solve.
+        affine_check_tracks: usize = ViewSelectionOptions::DEFAULT.wanted_tracks,
+        /// Triplets that are searched. Of wrong matches each takes a tenth of a second.
         most_triplets: usize = 2,
     }
 }
 
 const OPTIONS: SecondStructureOptions = SecondStructureOptions::DEFAULT;
+/// The component with most views.
+const LARGEST: u32 = 0;
 
 /// Tracks that agree on another rigid motion.
 pub struct SecondStructure {
     /// Whether each track of the input does.
     pub tracks: Vec<bool>,
-    /// What it leads to where it explains more of the input than the reconstruction: it is the scene then.
-    pub scene: Option<Ended>,
+    /// What it leads to where it explains more of the input than the reconstruction.
+    pub rival: Option<Ended>,
 }
 
 /// Searches the tracks that a reconstruction leaves out, in its views, for another rigid motion.
@@ -52,82 +55,101 @@ pub fn find(
     judged: &Judged,
     evidence: f64,
 ) -> Result<Option<SecondStructure>, Error> {
+    let Some((tracks, evidence_of_second)) = searched(problem, geometry, judged)? else { return Ok(None) };
+    if evidence_of_second < OPTIONS.least_share * evidence {
+        return Ok(None);
+    }
+    // What stands still in the image is no scene where something else moves, however many tracks it has.
+    let explains_more = |other: f64| geometry.of_static || other > evidence;
+    let rival =
+        explains_more(evidence_of_second).then(|| solved_without(problem, &judged.tracks.inlier)).transpose()?;
+    let rival = rival.filter(|rival| explains_more(rival.evidence(problem)));
+    Ok(Some(SecondStructure { tracks, rival }))
+}
+
+/// The tracks of another projective reconstruction and its evidence, if there is one.
+fn searched(problem: &Problem, geometry: &Geometry, judged: &Judged) -> Result<Option<(Vec<bool>, f64)>, Error> {
     let is_far = far_from(problem, geometry, judged);
     if is_far.iter().filter(|is_far| **is_far).count() < LEAST_INLIERS {
         return Ok(None);
     }
-    // What several parts of a reconstruction leave out may be what would join them.
-    let is_seen = |view: usize| geometry.cameras[view].is_some() && geometry.component_of_view[view] == 0;
-    let input = problem.input.only(|k| is_far[problem.track_of(k)] && is_seen(problem.view_of(k)));
-    // The detector is the same.
+    let is_registered = |view: usize| geometry.cameras[view].is_some() && geometry.component_of_view[view] == LARGEST;
+    let input = problem.input.restricted_to(|k| is_far[problem.track_of(k)] && is_registered(problem.view_of(k)));
+    // One detector found all tracks, so that the noise is known.
     let noise_px = Some(geometry.noise * problem.scale_px);
     let settings = SolveSettings { method: Method::Geometry, noise_px, ..problem.settings.clone() };
     let mut rest = problem.of_some(&input, &settings);
     rest.undone = lenses(problem, geometry, &rest);
-    let is_promising = |block: &Block| is_promising(&near_duplicates::without(&rest, block.clone()), rest.stop);
+    let passes = |block: &Block| passes_affine_check(&near_duplicates::without(&rest, block.clone()), rest.stop);
     let mut silent = Silent;
     let mut recorder = Recorder::new(&mut silent, rest.observed_views().len());
-    let second = sequence::reconstruct_quickly(&rest, is_promising, OPTIONS.most_triplets, &mut recorder)?;
-    let Some(second) = second else { return Ok(None) };
-    let evidence_of_second = second.evidence(problem.outlier_density);
-    if evidence_of_second < OPTIONS.least_share * evidence {
+    let found = sequence::reconstruct_quickly(&rest, passes, OPTIONS.most_triplets, &mut recorder)?;
+    let evidence = |found: &ProjectiveReconstruction| found.evidence(problem.outlier_density);
+    let Some(found) = found.filter(|found| found.tracks.len() >= LEAST_INLIERS && evidence(found) > 0.0) else {
         return Ok(None);
-    }
-    let agrees = |track: usize| second.tracks.binary_search(&problem.representative[track]).is_ok();
-    let tracks = (0..problem.tracks()).map(agrees).collect();
-    let scene = (evidence_of_second > evidence).then(|| of_the_rest(problem, judged)).transpose()?;
-    let scene = scene.filter(|scene| scene.evidence(problem) > evidence);
-    Ok(Some(SecondStructure { tracks, scene }))
+    };
+    let agrees = |track: usize| {
+        let representative = rest.representative[problem.representative[track]];
+        found.tracks.binary_search(&representative).is_ok() && !judged.tracks.inlier[track]
+    };
+    Ok(Some(((0..problem.tracks()).map(agrees).collect(), evidence(&found))))
 }
 
-/// Whether a search is worth its time: where that is short, or more tracks agree on affine cameras than determine
-/// projective ones. Any four do, and of wrong ones no fifth does (a test counts them).
-fn is_promising(block: &Block, stop: &StopToken) -> bool {
-    let agree = || priors::affine_irls(AffineSearch::new(&block.complete).centred(), LEAST_SUPPORT, stop).is_some();
-    block.tracks.len() < OPTIONS.asked_tracks || agree()
+/// Whether a block is small, or more of its tracks fit affine cameras than determine projective ones. Any four tracks
+/// fit some, and of wrong ones no fifth does (a test counts them).
+fn passes_affine_check(block: &Block, stop: &StopToken) -> bool {
+    let fits = || priors::affine_irls(AffineSearch::new(&block.complete).centred(), LEAST_SUPPORT, stop).is_some();
+    block.tracks.len() < OPTIONS.affine_check_tracks || fits()
 }
 
-/// The tracks that are no inliers, solved as an input of its own.
-fn of_the_rest(problem: &Problem, judged: &Judged) -> Result<Ended, Error> {
-    let input = problem.input.only(|k| !judged.tracks.inlier[problem.track_of(k)]);
+/// The input without these tracks, solved.
+fn solved_without(problem: &Problem, tracks: &[bool]) -> Result<Ended, Error> {
+    let input = problem.input.restricted_to(|k| !tracks[problem.track_of(k)]);
     let mut rest = problem.of_some(&input, problem.settings);
     let views = rest.observed_views().len();
     let mut ended = sequence::solve(&mut rest, &mut Recorder::new(&mut Silent, views))?;
     if let Ended::Block(Some(attempt)) = &mut ended {
-        // Of the rest alone.
+        // All tracks are to be judged, not those of the rest alone.
         attempt.judged = None;
     }
     Ok(ended)
 }
 
-/// What is said of tracks that agree on another motion.
-///
-/// * `second`: whether each track does
-/// * `first`: whether each is of the result
-pub fn warning(second: &[bool], first: &[bool]) -> Warning {
-    let [second, first] = [second, first].map(|tracks| tracks.iter().filter(|is_of| **is_of).count());
+/// Marks these tracks, but for inliers and static ones, which another warning reports, and says so; `None` where they are
+/// too few to be verified.
+pub fn mark(problem: &Problem, second: &[bool], tracks: &mut TrackResults) -> Option<Warning> {
+    let is_marked = |track: usize| second[track] && !tracks.inlier[track] && !problem.is_static[track];
+    let marked: Vec<bool> = (0..problem.tracks()).map(is_marked).collect();
+    let [second, first] = [&marked, &tracks.inlier].map(|tracks| tracks.iter().filter(|is_of| **is_of).count());
+    if second < LEAST_INLIERS {
+        return None;
+    }
+    tracks.second_structure = marked;
     let detail = format!(
         "{second} tracks that are left out agree on another rigid motion: a second moving body, or a repeated \
-         structure; the result is that of the set that explains more, {first} tracks, not of both"
+         structure; the result is of {first} other tracks, not of both"
     );
-    Warning::new(WarningCode::SecondStructure, detail)
+    Some(Warning::new(WarningCode::SecondStructure, detail))
 }
 
-/// Whether each track is far from the reconstruction, of those that a search may go by.
+/// Whether each track is far from the largest component of the reconstruction, of those that a search may go by. What
+/// is far from another component may be of the largest.
 fn far_from(problem: &Problem, geometry: &Geometry, judged: &Judged) -> Vec<bool> {
+    let squared = |k: usize| {
+        let residual_px = judged.observations.residual_px[problem.input.caller_index(k)];
+        let squared = residual_px.map_or(f64::INFINITY, |residual_px| (residual_px / problem.scale_px).powi(2));
+        geometry.given_weight(problem, k) * squared
+    };
     let is_far = |track: usize| {
         let seen = geometry.of_track(problem, track);
-        let squared: f64 = seen
-            .iter()
-            .map(|&k| judged.observations.residual_px[problem.input.caller_index(k)])
-            .map(|residual| residual.map_or(f64::INFINITY, |residual| (residual / problem.scale_px).powi(2)))
-            .sum();
         let gate = OPTIONS.far_gates * grow::gate(seen.len()) * geometry.noise.powi(2);
-        seen.len() >= VERIFIED && squared > gate
+        seen.len() >= VERIFIED && seen.iter().map(|&k| squared(k)).sum::<f64>() > gate
     };
-    (0..problem.tracks())
-        .map(|track| !judged.tracks.inlier[track] && problem.supports_growth(track, false) && is_far(track))
-        .collect()
+    let is_asked = |track: usize| {
+        let is_of_largest = geometry.component_of_track[track] == LARGEST;
+        is_of_largest && !judged.tracks.inlier[track] && problem.supports_growth(track, false)
+    };
+    (0..problem.tracks()).map(|track| is_asked(track) && is_far(track)).collect()
 }
 
 /// The lenses of a reconstruction, to be undone before others are looked for.

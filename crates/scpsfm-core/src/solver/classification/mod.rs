@@ -65,7 +65,7 @@ impl Geometry {
     }
 
     /// Weight of observation `k` by the sigma that it came with.
-    fn given_weight(&self, problem: &Problem, k: usize) -> f64 {
+    pub fn given_weight(&self, problem: &Problem, k: usize) -> f64 {
         if self.by_observation { problem.weights[k] } else { 1.0 }
     }
 

@@ -138,7 +138,7 @@ fn of_blocks(problem: &Problem, recorder: &mut Recorder) -> Result<Ended, Error>
 /// have fewer tracks than they should, of triplets; `None` where nothing stands.
 ///
 /// * `is_promising`: which blocks are worth a search
-/// * `most_triplets`: that are tried
+/// * `most_triplets`: how many triplets are searched
 ///
 /// # Errors
 /// As [`solve`].
@@ -151,10 +151,11 @@ pub fn reconstruct_quickly(
     let blocks = Blocks::of(problem).sets;
     let is_sparse =
         |views: &Vec<usize>| problem.block(views).tracks.len() < ViewSelectionOptions::DEFAULT.wanted_tracks;
-    let triplets = if blocks.iter().all(is_sparse) { all_triplets(problem) } else { Vec::new() };
+    let most_triplets = if blocks.iter().all(is_sparse) { most_triplets } else { 0 };
     let promising = blocks.into_iter().filter(|views| is_promising(&problem.block(views))).map(SeedViews::Block);
+    let triplets = (0..most_triplets.min(1)).flat_map(|_| all_triplets(problem)).take(most_triplets);
     let mut pairs = triplets::Pairs::new(problem);
-    for views in promising.chain(triplets.into_iter().take(most_triplets)) {
+    for views in promising.chain(triplets) {
         problem.stopped()?;
         let mut attempt = begin(problem, &views, &mut pairs, recorder)?;
         extend_projectively(problem, &mut attempt, false, recorder)?;
