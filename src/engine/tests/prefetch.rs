@@ -127,8 +127,7 @@ async fn what_was_begun_and_cannot_be_leased_is_stopped_and_solved_later() {
                      BEGIN SELECT RAISE(ABORT, 'broken'); END";
     test.store.execute(no_claims).await;
     test.engine.cancel(first).await.expect("exists");
-    test.solver.until_waiting(2).await;
-    // It is until its claim has failed.
+    // It is until its claim has failed. On a busy machine that may be before the solver is called, too.
     eventually(|| async { (!is_prefetched(&test, next)).then_some(()) }).await;
     assert_eq!(test.ended(first).await.state, JobState::Cancelled);
     assert_eq!(states(&test, next).await, [JobState::Queued]);
@@ -136,7 +135,7 @@ async fn what_was_begun_and_cannot_be_leased_is_stopped_and_solved_later() {
     test.solver.release();
     assert_eq!(test.ended(next).await.attempt, 1);
     assert_eq!(states(&test, next).await, [JobState::Queued, JobState::Running, JobState::Succeeded]);
-    assert_eq!(test.solver.calls.load(Ordering::SeqCst), 3);
+    assert!((2..=3).contains(&test.solver.calls.load(Ordering::SeqCst)));
 }
 
 #[tokio::test]
