@@ -134,8 +134,8 @@ fn of_blocks(problem: &Problem, recorder: &mut Recorder) -> Result<Ended, Error>
     })
 }
 
-/// The first projective reconstruction that a quick search leads to, without a calibration: of blocks, and where these
-/// have fewer tracks than they should, of triplets; `None` where nothing stands.
+/// The first projective reconstruction that a quick search leads to, without a calibration: of blocks, and where
+/// tracks are incomplete and blocks have fewer than they should, of triplets; `None` where nothing stands.
 ///
 /// * `is_promising`: which blocks are worth a search
 /// * `most_triplets`: how many triplets are searched
@@ -148,11 +148,12 @@ pub fn reconstruct_quickly(
     most_triplets: usize,
     recorder: &mut Recorder,
 ) -> Result<Option<ProjectiveReconstruction>, Error> {
-    let blocks = Blocks::of(problem).sets;
+    let blocks = Blocks::of(problem);
     let is_sparse =
         |views: &Vec<usize>| problem.block(views).tracks.len() < ViewSelectionOptions::DEFAULT.wanted_tracks;
-    let most_triplets = if blocks.iter().all(is_sparse) { most_triplets } else { 0 };
-    let promising = blocks.into_iter().filter(|views| is_promising(&problem.block(views))).map(SeedViews::Block);
+    let is_for_triplets = !blocks.is_whole && blocks.sets.iter().all(is_sparse);
+    let most_triplets = if is_for_triplets { most_triplets } else { 0 };
+    let promising = blocks.sets.into_iter().filter(|views| is_promising(&problem.block(views))).map(SeedViews::Block);
     let triplets = (0..most_triplets.min(1)).flat_map(|_| all_triplets(problem)).take(most_triplets);
     let mut pairs = triplets::Pairs::new(problem);
     for views in promising.chain(triplets) {
