@@ -4,12 +4,12 @@ use super::Error;
 use super::block::Block;
 use super::classification::{Geometry, Judged};
 use super::grow::{self, LEAST_INLIERS, LEAST_SUPPORT};
+use super::priors;
 use super::problem::{Problem, Undone, VERIFIED};
 use super::recorder::Recorder;
 use super::search::affine::AffineSearch;
 use super::sequence::{self, Ended, ProjectiveReconstruction};
 use super::view_selection::ViewSelectionOptions;
-use super::{near_duplicates, priors};
 use crate::domain::result::TrackResults;
 use crate::domain::{Method, Silent, SolveSettings, StopToken, Warning, WarningCode};
 
@@ -80,17 +80,17 @@ fn searched(problem: &Problem, geometry: &Geometry, judged: &Judged) -> Result<O
     let settings = SolveSettings { method: Method::Geometry, noise_px, ..problem.settings.clone() };
     let mut rest = problem.of_some(&input, &settings);
     rest.undone = lenses(problem, geometry, &rest);
-    let passes = |block: &Block| passes_affine_check(&near_duplicates::without(&rest, block.clone()), rest.stop);
-    let mut silent = Silent;
-    let mut recorder = Recorder::new(&mut silent, rest.observed_views().len());
-    let found = sequence::reconstruct_quickly(&rest, passes, OPTIONS.most_triplets, &mut recorder)?;
+    let passes = |block: &Block| passes_affine_check(block, rest.stop);
+    let views = rest.observed_views().len();
+    let triplets = OPTIONS.most_triplets;
+    let found = sequence::reconstruct_quickly(&rest, passes, triplets, &mut Recorder::new(&mut Silent, views))?;
     let evidence = |found: &ProjectiveReconstruction| found.evidence(problem.outlier_density);
     let Some(found) = found.filter(|found| found.tracks.len() >= LEAST_INLIERS && evidence(found) > 0.0) else {
         return Ok(None);
     };
     let agrees = |track: usize| {
         let representative = rest.representative[problem.representative[track]];
-        found.tracks.binary_search(&representative).is_ok() && !judged.tracks.inlier[track]
+        found.tracks.binary_search(&representative).is_ok()
     };
     Ok(Some(((0..problem.tracks()).map(agrees).collect(), evidence(&found))))
 }

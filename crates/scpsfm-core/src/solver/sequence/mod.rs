@@ -43,7 +43,7 @@ use super::problem::Problem;
 use super::reconstruction::Reconstruction;
 use super::recorder::Recorder;
 use super::view_selection::{SeedViews, ViewSelectionOptions};
-use super::{Error, view_selection};
+use super::{Error, near_duplicates, view_selection};
 use crate::domain::Stage;
 use extended::extend;
 use options::{ExtensionOptions, GrowthOptions};
@@ -111,7 +111,8 @@ fn of_blocks(problem: &Problem, recorder: &mut Recorder) -> Result<Ended, Error>
     let mut best = by_projective_extension(problem, None, starts(first, !is_quick, cheap), recorder)?;
     let leaves_most = |best: &Attempt| !best.is_good() && best.leaves_most_views(problem);
     if !blocks.is_whole && metric.is_none() && best.as_ref().is_none_or(leaves_most) {
-        let starts = all_triplets(problem).into_iter().map(Start::Views).collect();
+        let triplets = view_selection::triplets(problem, &vec![true; problem.views()]);
+        let starts = triplets.into_iter().map(|views| Start::Views(SeedViews::Triplet(views))).collect();
         best = by_projective_extension(problem, best, starts, recorder)?;
     }
     if is_quick && metric.is_none() && !stands(&best) {
@@ -137,7 +138,7 @@ fn of_blocks(problem: &Problem, recorder: &mut Recorder) -> Result<Ended, Error>
 /// The first projective reconstruction that a quick search leads to, without a calibration: of blocks, and where
 /// tracks are incomplete and blocks have fewer than they should, of triplets; `None` where nothing stands.
 ///
-/// * `is_promising`: which blocks are worth a search
+/// * `is_promising`: which blocks, without near-duplicates, are worth a search
 /// * `most_triplets`: how many triplets are searched
 ///
 /// # Errors
@@ -148,42 +149,31 @@ pub fn reconstruct_quickly(
     most_triplets: usize,
     recorder: &mut Recorder,
 ) -> Result<Option<ProjectiveReconstruction>, Error> {
-    let blocks = Blocks::of(problem);
-    let is_sparse =
-        |views: &Vec<usize>| problem.block(views).tracks.len() < ViewSelectionOptions::DEFAULT.wanted_tracks;
-    let is_for_triplets = !blocks.is_whole && blocks.sets.iter().all(is_sparse);
-    let most_triplets = if is_for_triplets { most_triplets } else { 0 };
-    let promising = blocks.sets.into_iter().filter(|views| is_promising(&problem.block(views))).map(SeedViews::Block);
-    let triplets = (0..most_triplets.min(1)).flat_map(|_| all_triplets(problem)).take(most_triplets);
-    let mut pairs = triplets::Pairs::new(problem);
-    for views in promising.chain(triplets) {
+    let Blocks { sets, is_whole } = Blocks::of(problem);
+    let blocks: Vec<Block> = sets.iter().map(|views| near_duplicates::without(problem, problem.block(views))).collect();
+    let are_sparse = blocks.iter().all(|block| block.tracks.len() < ViewSelectionOptions::DEFAULT.wanted_tracks);
+    for block in blocks.into_iter().filter(is_promising) {
         problem.stopped()?;
-        let mut attempt = begin(problem, &views, &mut pairs, recorder)?;
+        let mut attempt = attempt::search_block(problem, block, QUICK_SEED, recorder)?;
+        extend_projectively(problem, &mut attempt, false, recorder)?;
+        if attempt.projective.is_some() {
+            return Ok(attempt.projective);
+        }
+    }
+    if is_whole || !are_sparse {
+        return Ok(None);
+    }
+    let mut pairs = triplets::Pairs::new(problem);
+    let triplets = view_selection::triplets(problem, &vec![true; problem.views()]);
+    for views in triplets.into_iter().take(most_triplets) {
+        problem.stopped()?;
+        let mut attempt = pairs.attempt(&views, recorder)?;
         extend_projectively(problem, &mut attempt, false, recorder)?;
         if attempt.projective.is_some() {
             return Ok(attempt.projective);
         }
     }
     Ok(None)
-}
-
-/// Triplets of all views.
-fn all_triplets(problem: &Problem) -> Vec<SeedViews> {
-    let triplets = view_selection::triplets(problem, &vec![true; problem.views()]);
-    triplets.into_iter().map(SeedViews::Triplet).collect()
-}
-
-/// What a quick search finds of views that a reconstruction may begin with.
-fn begin(
-    problem: &Problem,
-    views: &SeedViews,
-    pairs: &mut triplets::Pairs,
-    recorder: &mut Recorder,
-) -> Result<Attempt, Error> {
-    match views {
-        SeedViews::Block(views) => attempt::search_block(problem, problem.block(views), QUICK_SEED, recorder),
-        SeedViews::Triplet(views) => pairs.attempt(views, recorder),
-    }
 }
 
 impl Ended {
@@ -361,7 +351,13 @@ fn by_projective_extension(
             Start::Found { attempt, keeps } => (*attempt, keeps),
             Start::Views(views) => {
                 recorder.begin_block(k, count);
-                (begin(problem, &views, &mut pairs, recorder)?, false)
+                let attempt = match views {
+                    SeedViews::Block(views) => {
+                        attempt::search_block(problem, problem.block(&views), QUICK_SEED, recorder)?
+                    }
+                    SeedViews::Triplet(views) => pairs.attempt(&views, recorder)?,
+                };
+                (attempt, false)
             }
         };
         extend_projectively(problem, &mut attempt, keeps, recorder)?;
