@@ -6,11 +6,11 @@ use super::adjust::{self, Extract};
 use super::model::Model;
 use super::options::StretchOptions;
 use super::{own_focals, windows};
-use crate::domain::{FocalPrior, Task, Warning, WarningCode};
+use crate::domain::{FocalPrior, Grade, Task, Warning, WarningCode};
 use crate::geometry::bundle::metric::{Intrinsics, MetricReconstruction};
 use crate::geometry::observation::Observation;
 use crate::geometry::{Camera, Point};
-use crate::solver::calibration::{self, GradeOptions, Outcome, Uncalibrated};
+use crate::solver::calibration::{self, Outcome, Uncalibrated};
 use crate::solver::problem::{Problem, VERIFIED};
 use crate::solver::recorder::Recorder;
 use crate::solver::{Error, view_selection};
@@ -23,37 +23,78 @@ const OFF_CENTRE: f64 = 0.01;
 /// Calibrates each camera from the landmarks and observations that fit best, takes the models over, adjusts everything
 /// under them and asks the windows; one outcome a camera.
 ///
+/// What fits best is judged behind the lens that the seed had. Where all observations, behind the lens that was found,
+/// lead to another focal length than the calibration gives, everything is calibrated a second time, from what fits best
+/// there.
+///
 /// # Errors
 /// [`Error::Stopped`].
 pub fn calibrate(problem: &Problem, model: &mut Model, recorder: &mut Recorder) -> Result<Vec<Outcome>, Error> {
     if problem.has_own_focals() {
         return own_focals::calibrate(problem, model, recorder).map(|outcome| vec![outcome]);
     }
-    let registered = model.registered();
-    // All cameras together where they have few views, else each by itself.
-    let runs: Vec<Vec<usize>> = match registered.len() <= OPTIONS.most_views {
-        true => vec![registered],
-        false => (0..problem.cameras)
-            .map(|camera| registered.iter().copied().filter(|&view| problem.camera_of[view] == camera).collect())
-            .collect(),
-    };
-    let mut outcomes: Vec<Outcome> = (0..problem.cameras).map(|_| too_few(0)).collect();
-    for (k, views) in runs.iter().enumerate() {
-        recorder.step(Task::Cameras, k + 1, runs.len(), 0.0);
-        let found = match views.len() < view_selection::LEAST_VIEWS {
-            true => views.iter().map(|&view| (problem.camera_of[view], too_few(views.len()))).collect(),
-            false => of_cameras(problem, model, views, recorder)?,
-        };
-        found.into_iter().for_each(|(camera, outcome)| outcomes[camera] = outcome);
+    let mut found = Calibrated::of_registered(problem, model, recorder)?;
+    if found.has_moved {
+        let mut again = model.clone();
+        let second = Calibrated::of_registered(problem, &mut again, recorder)?;
+        if second.is_nowhere_worse_than(&found) {
+            (*model, found) = (again, second);
+        }
     }
-    super::structure::triangulate(problem, model, recorder);
-    adjust::all(problem, model, recorder);
     report_found(problem, model, recorder);
-    for (camera, outcome) in outcomes.iter_mut().enumerate() {
-        admit_difference(model.lenses[camera].intrinsics.focal.ln(), outcome, &problem.calibration_options.grades);
+    for (camera, outcome) in found.outcomes.iter_mut().enumerate() {
         windows::reconcile(problem, model, camera, outcome, recorder)?;
     }
-    Ok(outcomes)
+    Ok(found.outcomes)
+}
+
+/// What was found of all cameras.
+struct Calibrated {
+    /// One a camera, with a sigma that admits what lies between its focal length and that of the model.
+    outcomes: Vec<Outcome>,
+    /// Whether that is more than the sigma of a calibration that was not refused.
+    has_moved: bool,
+}
+
+impl Calibrated {
+    /// Calibrates the cameras of all registered views, takes the models over and adjusts everything under them.
+    fn of_registered(problem: &Problem, model: &mut Model, recorder: &mut Recorder) -> Result<Self, Error> {
+        let registered = model.registered();
+        // All cameras together where they have few views, else each by itself.
+        let runs: Vec<Vec<usize>> = match registered.len() <= OPTIONS.most_views {
+            true => vec![registered],
+            false => (0..problem.cameras)
+                .map(|camera| registered.iter().copied().filter(|&view| problem.camera_of[view] == camera).collect())
+                .collect(),
+        };
+        let mut outcomes: Vec<Outcome> = (0..problem.cameras).map(|_| too_few(0)).collect();
+        for (k, views) in runs.iter().enumerate() {
+            recorder.step(Task::Cameras, k + 1, runs.len(), 0.0);
+            let found = match views.len() < view_selection::LEAST_VIEWS {
+                true => views.iter().map(|&view| (problem.camera_of[view], too_few(views.len()))).collect(),
+                false => of_cameras(problem, model, views, recorder)?,
+            };
+            found.into_iter().for_each(|(camera, outcome)| outcomes[camera] = outcome);
+        }
+        super::structure::triangulate(problem, model, recorder);
+        adjust::all(problem, model, recorder);
+        let mut found = Self { outcomes, has_moved: false };
+        for (camera, outcome) in found.outcomes.iter_mut().enumerate() {
+            let (Some(graded), Some(sigma)) = (outcome.intrinsics(), outcome.sigma_log_focal) else { continue };
+            let difference = (model.lenses[camera].intrinsics.focal / graded.focal).ln().abs();
+            if difference > sigma {
+                found.has_moved |= outcome.grade != Grade::ProjectiveOnly;
+                outcome.raise_sigma(difference, &problem.calibration_options.grades);
+            }
+        }
+        Ok(found)
+    }
+
+    /// Whether no camera has a worse grade.
+    fn is_nowhere_worse_than(&self, other: &Self) -> bool {
+        let mut pairs = self.outcomes.iter().zip(&other.outcomes);
+        pairs.all(|(own, other)| own.grade.worse(other.grade) == other.grade)
+    }
 }
 
 /// Reports the points and the focal length, a mean where views have their own, of the first camera with registered
@@ -142,15 +183,6 @@ pub fn take_over(model: &mut Model, extract: &mut Extract, found: &[(usize, Outc
 /// Observations of each of these views that a calibration is made from.
 pub fn of_view(views: &[usize]) -> usize {
     (OPTIONS.observations / views.len()).clamp(OPTIONS.of_view.0, OPTIONS.of_view.1)
-}
-
-/// Raises sigma to what lies between the focal length that was graded and the one that all observations led to.
-fn admit_difference(log_focal: f64, outcome: &mut Outcome, grades: &GradeOptions) {
-    let (Some(intrinsics), Some(sigma)) = (outcome.intrinsics(), outcome.sigma_log_focal) else { return };
-    let difference = (log_focal - intrinsics.focal.ln()).abs();
-    if difference > sigma {
-        outcome.raise_sigma(difference, grades);
-    }
 }
 
 /// The run of at most [`StretchOptions::most_views`] of these views that keeps most observations.
