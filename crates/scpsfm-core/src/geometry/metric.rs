@@ -8,6 +8,7 @@ use super::daq::{self, CanonicalFrame, Daq};
 use super::observation::Observation;
 use super::procrustes::nearest_rotation;
 use super::statistics::median;
+use super::triangulation;
 
 /// Distance at which points are held, in median depths: beyond it the depth of a point moves no observation, while a
 /// point at infinity would have no coordinates.
@@ -143,6 +144,42 @@ pub fn cheirality(reconstruction: &MetricReconstruction, observations: &[Observa
     if count > 0 { front as f64 / count as f64 } else { 0.0 }
 }
 
+/// Moves points to where the cameras see them, where they cost less there; how many it moved.
+///
+/// * `which`: one a point, those that may move
+pub fn retriangulate(reconstruction: &mut MetricReconstruction, observations: &[Observation], which: &[bool]) -> usize {
+    if !which.contains(&true) {
+        return 0;
+    }
+    let mut of_point = vec![Vec::new(); reconstruction.points.len()];
+    let counts = |seen: &&Observation| which.get(seen.point) == Some(&true);
+    for seen in observations.iter().filter(counts) {
+        if seen.is_usable(reconstruction.poses.len(), of_point.len()) {
+            of_point[seen.point].push(*seen);
+        }
+    }
+    let cameras = reconstruction.cameras();
+    let mut moved = 0;
+    for (point, seen) in of_point.iter().enumerate().filter(|(_, seen)| !seen.is_empty()) {
+        let pinhole = |seen: &Observation| reconstruction.intrinsics_of(seen.view).undistorted(seen);
+        let undistorted: Vec<Observation> = seen.iter().filter_map(pinhole).collect();
+        let homogeneous = triangulation::linear(&cameras, &undistorted);
+        let position: Vector3<f64> = homogeneous.xyz() / homogeneous.w;
+        let cost = |reconstruction: &MetricReconstruction| -> f64 {
+            seen.iter().map(|seen| seen.weight * reconstruction.residual(seen).norm_squared()).sum()
+        };
+        let before = cost(reconstruction);
+        let former = std::mem::replace(&mut reconstruction.points[point], position);
+        let now = cost(reconstruction);
+        if now.is_finite() && (now < before || before.is_nan()) {
+            moved += 1;
+        } else {
+            reconstruction.points[point] = former;
+        }
+    }
+    moved
+}
+
 #[cfg(test)]
 mod tests {
     use super::super::bundle::testing;
@@ -167,6 +204,32 @@ mod tests {
                 let error = upgraded.residual(seen).norm();
                 assert!(error < 1e-5, "seed {seed}: {error}");
             }
+        }
+    }
+
+    /// Far out, behind the cameras or not a number, behind a lens or not; and what may not move, or fits already, stays.
+    #[test]
+    fn points_that_went_astray_are_put_back() {
+        for (seed, radial_k1) in [(0, 0.0), (1, -0.2)] {
+            let mut scene = testing::scene(seed, 6, 20, 0.0);
+            scene.intrinsics.radial[0] = radial_k1;
+            scene.observe(0.0, &mut rand::SeedableRng::seed_from_u64(seed));
+            let right = scene.reconstruction();
+            let mut astray = right.clone();
+            astray.points[1] *= 1e7;
+            astray.points[2] = -astray.points[2];
+            astray.points[3].x = f64::NAN;
+            astray.points[4] *= 2.0;
+            let which: Vec<bool> = (0..20).map(|point| point != 4).collect();
+            assert!(retriangulate(&mut astray, &scene.observations, &which) >= 3, "seed {seed}");
+            assert_eq!(astray.points[4], right.points[4] * 2.0, "seed {seed}");
+            for point in (0..20).filter(|point| *point != 4) {
+                let error = (astray.points[point] - right.points[point]).norm();
+                assert!(error < 1e-6, "seed {seed}, point {point}: {error}");
+            }
+            let before = astray.clone();
+            assert_eq!(retriangulate(&mut astray, &[], &which), 0);
+            assert_eq!(astray.points, before.points);
         }
     }
 

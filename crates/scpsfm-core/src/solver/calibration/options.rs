@@ -134,6 +134,10 @@ options! {
         /// Adjusted starts this near in log focal, and within this share in cost, are the same minimum.
         same_minimum: f64 = 0.01,
         same_cost: f64 = 0.1,
+        /// Mean squared residual of a point, in that of all observations, above which it may have gone astray: noise
+        /// takes one point of three views in ten million so far. It is moved only where it costs less, so that a
+        /// lower bound would cost time and nothing else.
+        astray_above: f64 = 10.0,
         /// Points that take part in the search: more tell no minimum from another that these do not.
         points: usize = 150,
         /// Points below which the search does not thin out a view.

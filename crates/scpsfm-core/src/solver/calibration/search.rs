@@ -1,6 +1,6 @@
 //! The search for the metric reconstruction: many starts, few that converge.
 
-use nalgebra::{Vector2, Vector3};
+use nalgebra::Vector2;
 
 use super::fit::Fit;
 use super::options::{CalibrationOptions, SearchOptions};
@@ -12,10 +12,9 @@ use crate::geometry::bundle::metric::{
 };
 use crate::geometry::bundle::{Options, Report};
 use crate::geometry::daq::{self, CanonicalFrame, Daq, Free};
-use crate::geometry::metric::{cheirality, upgrade, upgrade_translation};
+use crate::geometry::metric::{cheirality, retriangulate, upgrade, upgrade_translation};
 use crate::geometry::observation::Observation;
 use crate::geometry::statistics::root_mean_square;
-use crate::geometry::triangulation;
 
 /// A converged metric reconstruction.
 #[derive(Debug, Clone)]
@@ -96,7 +95,7 @@ pub(super) struct Search<'a> {
 impl Search<'_> {
     /// The minimum that a reconstruction converges to with this model.
     pub fn converged(&self, start: MetricReconstruction, model: IntrinsicsModel) -> Minimum {
-        self.adjusted(&self.problem.options.search.to_convergence(), start, model)
+        self.converge(&self.problem.options.search.to_convergence(), start, model).0
     }
 
     /// The same; `None` where its cost will not come near this one, so that it is none to compare with.
@@ -105,7 +104,7 @@ impl Search<'_> {
         // Of costs below the noise no difference tells anything.
         let told_apart = cost + grades.indistinguishable * self.problem.noise.powi(2);
         let hopeless_above = (options.hopeless_cost * cost).max(told_apart);
-        let (minimum, report) = self.run(&Options { hopeless_above, ..options.to_convergence() }, start, model);
+        let (minimum, report) = self.converge(&Options { hopeless_above, ..options.to_convergence() }, start, model);
         (!report.is_hopeless).then_some(minimum)
     }
 
@@ -129,6 +128,36 @@ impl Search<'_> {
         }
         Error::check(self.stop)?;
         Ok(distinct(found, self.problem))
+    }
+
+    /// Adjusts, and once more where points that went astray were put back.
+    fn converge(&self, options: &Options, start: MetricReconstruction, model: IntrinsicsModel) -> (Minimum, Report) {
+        let (mut minimum, report) = self.run(options, start, model);
+        let again = !report.is_hopeless && self.put_back(&mut minimum);
+        if again { self.run(options, minimum.reconstruction, model) } else { (minimum, report) }
+    }
+
+    /// Puts the points back that went astray on the way to a minimum; whether there were any.
+    ///
+    /// A step may take a point past infinity, or so far out that nothing leads it back. It then costs many times what
+    /// others do, and lens and poses give way to it.
+    fn put_back(&self, minimum: &mut Minimum) -> bool {
+        let (reconstruction, observations) = (&mut minimum.reconstruction, self.problem.observations);
+        if reconstruction.has_common_centre {
+            return false;
+        }
+        let mean = minimum.cost / observations.len() as f64;
+        let (views, points) = (reconstruction.poses.len(), reconstruction.points.len());
+        let mut costs = vec![(0.0, 0.0); points];
+        for seen in observations.iter().filter(|seen| seen.is_usable(views, points)) {
+            let (cost, count) = &mut costs[seen.point];
+            *cost += seen.weight * reconstruction.residual(seen).norm_squared();
+            *count += 1.0;
+        }
+        // Written so that NaN counts as astray.
+        let in_place = |(cost, count): (f64, f64)| cost <= self.problem.options.search.astray_above * mean * count;
+        let astray: Vec<bool> = costs.into_iter().map(|cost| !in_place(cost)).collect();
+        retriangulate(reconstruction, observations, &astray) > 0
     }
 
     fn adjusted(&self, options: &Options, start: MetricReconstruction, model: IntrinsicsModel) -> Minimum {
@@ -229,7 +258,8 @@ impl Search<'_> {
             let Some(mut minimum) = on_subset.converged_near(start.reconstruction, model, cheapest) else { continue };
             cheapest = cheapest.min(minimum.cost);
             if let Some(chosen) = &chosen {
-                fill_points(&mut minimum, chosen, problem.observations);
+                let took_no_part: Vec<bool> = chosen.iter().map(|chosen| !chosen).collect();
+                retriangulate(&mut minimum.reconstruction, problem.observations, &took_no_part);
                 minimum = self.converged(minimum.reconstruction, model);
             }
             converged.push(minimum);
@@ -344,26 +374,4 @@ fn subsample(
     }
     let subset = observations.iter().filter(in_range).filter(|seen| chosen[seen.point]).copied().collect();
     (Some(subset), Some(chosen))
-}
-
-/// Triangulates the points that took no part in the search with the cameras it found.
-fn fill_points(minimum: &mut Minimum, chosen: &[bool], observations: &[Observation]) {
-    let cameras = minimum.reconstruction.cameras();
-    let points = &mut minimum.reconstruction.points;
-    let mut of_point = vec![Vec::new(); points.len()];
-    for seen in observations.iter().filter(|seen| seen.view < cameras.len()) {
-        if let Some(of_point) = of_point.get_mut(seen.point) {
-            of_point.push(*seen);
-        }
-    }
-    for ((point, of_point), chosen) in points.iter_mut().zip(&of_point).zip(chosen) {
-        if *chosen || of_point.is_empty() {
-            continue;
-        }
-        let homogeneous = triangulation::linear(&cameras, of_point);
-        let position: Vector3<f64> = homogeneous.xyz() / homogeneous.w;
-        if position.iter().all(|value| value.is_finite()) {
-            *point = position;
-        }
-    }
 }

@@ -56,6 +56,37 @@ fn the_options_bound_the_grades() {
     assert_eq!(grade(1e-9, 1e-9), Grade::ProjectiveOnly);
 }
 
+/// A point so far out that nothing leads it back is put back, and would else cost many times the noise.
+#[test]
+fn a_point_that_went_astray_does_not_bend_the_minimum() {
+    for seed in 0..5 {
+        let scene = testing::scene(seed, 6, 40, 1e-3);
+        let (cameras, points) = projective_problem(&scene, seed);
+        let converged = |start: &MetricReconstruction, astray_above: f64| {
+            let mut options = CalibrationOptions::DEFAULT;
+            options.search.astray_above = astray_above;
+            let problem =
+                Uncalibrated { options: &options, ..of_one_lens(&cameras, &points, &scene.observations, 1e-3) };
+            let priors = [IntrinsicsPrior::NONE];
+            let search = Search { problem: &problem, priors: &priors, stop: &StopToken::default() };
+            search.converged(start.clone(), IntrinsicsModel::FOCAL)
+        };
+        let start = scene.reconstruction();
+        let bound = CalibrationOptions::DEFAULT.search.astray_above;
+        let expected = converged(&start, bound);
+        let mut astray = start.clone();
+        let centre = start.poses[0].rotation.tr_mul(&-start.poses[0].translation);
+        let distance = |point: &usize| (start.points[*point] - centre).norm();
+        let farthest = (0..40).max_by(|a, b| distance(a).total_cmp(&distance(b))).expect("points");
+        astray.points[farthest] = centre + (start.points[farthest] - centre) * 1e7;
+        let (found, left) = (converged(&astray, bound), converged(&astray, f64::INFINITY));
+        let difference = found.log_focal() - expected.log_focal();
+        println!("seed {seed}: {:e}, {:e}, left {:e}; {difference:e}", expected.cost, found.cost, left.cost);
+        assert!(left.cost > 3.0 * expected.cost, "seed {seed}");
+        assert!((found.cost / expected.cost - 1.0).abs() < 1e-4 && difference.abs() < 1e-4, "seed {seed}");
+    }
+}
+
 fn calibrated(scene: &TestScene, seed: u64, noise: f64) -> Outcome {
     calibrated_knowing(scene, seed, noise, None)
 }
