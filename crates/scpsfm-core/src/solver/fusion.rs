@@ -37,8 +37,10 @@ pub struct Fused {
     pub freedom: f64,
 }
 
-/// Fuses estimates that have this share of their observations in common, and so err alike by as much; `None` for fewer
-/// than two.
+/// Fuses estimates that have this share of their observations in common; `None` for fewer than two.
+///
+/// What two have in common says no more than the one says that knows less: of information `i_1 >= i_2` it is
+/// `shared i_2`, and their covariance is that over `i_1 i_2`, the share of the lesser variance.
 pub fn fuse(estimates: &[Estimate], shared: f64) -> Option<Fused> {
     if estimates.len() < 2 {
         return None;
@@ -48,12 +50,14 @@ pub fn fuse(estimates: &[Estimate], shared: f64) -> Option<Fused> {
     };
     // Variance of the weighted sum: what two have in common adds up.
     let variance_of_sum = |weight: &[f64], misfit: f64| -> f64 {
-        let own = |(weight, estimate): (&f64, &Estimate)| {
-            let squared = estimate.sigma.powi(2);
-            weight * weight * (squared * (1.0 - shared) + misfit * misfit)
-        };
-        let in_common: f64 = weight.iter().zip(estimates).map(|(weight, estimate)| weight * estimate.sigma).sum();
-        weight.iter().zip(estimates).map(own).sum::<f64>() + shared * in_common * in_common
+        let mut variance = 0.0;
+        for (k, (&of_one, one)) in weight.iter().zip(estimates).enumerate() {
+            variance += of_one * of_one * (one.sigma.powi(2) + misfit * misfit);
+            for (&of_other, other) in weight[..k].iter().zip(estimates) {
+                variance += 2.0 * of_one * of_other * shared * one.sigma.min(other.sigma).powi(2);
+            }
+        }
+        variance
     };
     let weight = weights(0.0);
     let total: f64 = weight.iter().sum();
@@ -132,6 +136,17 @@ mod tests {
         assert_eq!(fused.misfit, 0.0);
         assert!((fused.sigma - 0.005).abs() < 1e-12, "{fused:?}");
         assert_eq!(fuse(&estimates(&[(0.0, 0.01)]), 0.0), None);
+    }
+
+    /// The strong one knows all that the weak one does: together they know hardly less than the strong one alone, and
+    /// differ by the root of the difference of their variances (Hausman 1978, "Specification tests in econometrics").
+    #[test]
+    fn what_two_estimates_have_in_common_is_bounded_by_the_weaker() {
+        let fused = |by: f64| fuse(&estimates(&[(0.0, 0.005), (by, 0.01)]), 1.0).expect("two");
+        assert!((0.005..0.0055).contains(&fused(0.0).formal), "{:?}", fused(0.0));
+        let expected = (0.01f64.powi(2) - 0.005f64.powi(2)).sqrt();
+        assert!((fused(expected).chi_square - 1.0).abs() < 1e-9, "{:?}", fused(expected));
+        assert!(!fused(1.8 * expected).differ() && fused(2.1 * expected).differ());
     }
 
     #[test]

@@ -25,8 +25,7 @@ pub fn reconcile(
     let (estimates, shared) = estimates(problem, model, camera, recorder)?;
     let Some(fused) = fuse(&estimates, shared) else { return Ok(()) };
     let apart = fused.log_focal - model.log_focal(camera, &of_camera(problem, model, camera));
-    // The windows' own formal variance is taken off: only what lies beyond it raises the sigma of the whole.
-    let beyond = |value: f64| (value.powi(2) - fused.formal.powi(2)).max(0.0).sqrt();
+    let beyond = |value: f64| of_whole(value, own, fused.formal);
     // Windows that know little differ, and are apart from the whole, by chance.
     let by_spread = if fused.differ() { own.hypot(beyond(fused.sigma)) } else { own };
     let is_apart = apart.abs() > OPTIONS.significant_distance * fused.formal && beyond(apart) > by_spread;
@@ -45,6 +44,16 @@ pub fn reconcile(
     };
     raise(outcome, sigma, &reason, &problem.calibration_options.grades);
     Ok(())
+}
+
+/// What a deviation of the windows' mean says of the whole. Their own formal variance is taken off; and what moves
+/// windows that know little (a few wrong observations, a lens that is a little off) moves the whole by as much less as
+/// it knows more.
+///
+/// * `own`: sigma of the whole
+/// * `formal`: sigma of the windows' mean
+fn of_whole(deviation: f64, own: f64, formal: f64) -> f64 {
+    (own / formal).min(1.0) * (deviation.powi(2) - formal.powi(2)).max(0.0).sqrt()
 }
 
 /// Views of a camera that say something of it, increasing.
@@ -148,6 +157,15 @@ mod tests {
         let misfit = |count: usize| fuse(&apart, of_run(count)).expect("two").misfit;
         assert_eq!(misfit(8), 0.0);
         assert!((misfit(5) - 0.005).abs() < 1e-9, "{}", misfit(5));
+    }
+
+    #[test]
+    fn windows_that_know_little_say_little() {
+        assert_eq!(of_whole(0.01, 0.02, 0.01), 0.0);
+        // As sure as the whole: all that is beyond chance.
+        assert!((of_whole(0.05, 0.03, 0.03) - 0.04).abs() < 1e-12 && (of_whole(0.05, 0.06, 0.03) - 0.04).abs() < 1e-12);
+        // A tenth as sure: a tenth of it.
+        assert!((of_whole(0.05, 0.003, 0.03) - 0.004).abs() < 1e-12);
     }
 
     #[test]
