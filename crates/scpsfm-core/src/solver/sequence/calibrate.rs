@@ -59,14 +59,7 @@ struct Calibrated {
 impl Calibrated {
     /// Calibrates the cameras of all registered views, takes the models over and adjusts everything under them.
     fn of_registered(problem: &Problem, model: &mut Model, recorder: &mut Recorder) -> Result<Self, Error> {
-        let registered = model.registered();
-        // All cameras together where they have few views, else each by itself.
-        let runs: Vec<Vec<usize>> = match registered.len() <= OPTIONS.most_views {
-            true => vec![registered],
-            false => (0..problem.cameras)
-                .map(|camera| registered.iter().copied().filter(|&view| problem.camera_of[view] == camera).collect())
-                .collect(),
-        };
+        let runs = runs(problem, model);
         let mut outcomes: Vec<Outcome> = (0..problem.cameras).map(|_| too_few(0)).collect();
         for (k, views) in runs.iter().enumerate() {
             recorder.step(Task::Cameras, k + 1, runs.len(), 0.0);
@@ -94,6 +87,23 @@ impl Calibrated {
     fn is_nowhere_worse_than(&self, other: &Self) -> bool {
         let mut pairs = self.outcomes.iter().zip(&other.outcomes);
         pairs.all(|(own, other)| own.grade.worse(other.grade) == other.grade)
+    }
+}
+
+/// Registered views whose cameras are calibrated together: all, where they are few or a stretch of them holds enough of
+/// each camera for a comparison with projective cameras; else those of each camera by itself.
+fn runs(problem: &Problem, model: &Model) -> Vec<Vec<usize>> {
+    let registered = model.registered();
+    let of_camera = |views: &[usize], camera: usize| -> Vec<usize> {
+        views.iter().copied().filter(|&view| problem.camera_of[view] == camera).collect()
+    };
+    let stretch = densest(problem, model, &registered);
+    let holds_enough = |camera: usize| {
+        of_camera(&registered, camera).is_empty() || of_camera(&stretch, camera).len() >= view_selection::LEAST_VIEWS
+    };
+    match registered.len() <= OPTIONS.most_views || (0..problem.cameras).all(holds_enough) {
+        true => vec![registered],
+        false => (0..problem.cameras).map(|camera| of_camera(&registered, camera)).collect(),
     }
 }
 
