@@ -96,6 +96,12 @@ impl Undone {
         Some(Self { lenses, radii, observations })
     }
 
+    /// The lenses of some cameras undone, as far as they distort and image all observations; `None` where none is.
+    pub fn of_cameras(problem: &Problem, lenses: impl IntoIterator<Item = (usize, Intrinsics)>) -> Option<Self> {
+        let distorting = lenses.into_iter().filter(|(_, lens)| lens.distorts());
+        distorting.fold(None, |undone, (camera, lens)| Self::new(problem, undone.as_ref(), camera, lens).or(undone))
+    }
+
     /// The lens of the images of a camera for which these intrinsics are found once its lens is undone.
     pub fn behind(&self, camera: usize, found: &Intrinsics) -> Intrinsics {
         let lens = &self.lenses[camera];

@@ -154,16 +154,12 @@ fn far_from(problem: &Problem, geometry: &Geometry, judged: &Judged) -> Vec<bool
 
 /// The lenses of a reconstruction, to be undone before others are looked for.
 fn lenses(problem: &Problem, geometry: &Geometry, rest: &Problem) -> Option<Undone> {
-    let mut undone = None;
-    for camera in 0..problem.cameras {
-        let view =
-            (0..problem.views()).find(|&view| problem.camera_of[view] == camera && geometry.cameras[view].is_some());
-        let lens = view.and_then(|view| geometry.lenses.get(view)).filter(|lens| lens.distorts());
-        if let Some(lens) = lens {
-            undone = Undone::new(rest, undone.as_ref(), camera, *lens).or(undone);
-        }
-    }
-    undone
+    let lens = |camera: usize| {
+        let is_of = |view: &usize| problem.camera_of[*view] == camera && geometry.cameras[*view].is_some();
+        let view = (0..problem.views()).find(is_of)?;
+        Some((camera, *geometry.lenses.get(view)?))
+    };
+    Undone::of_cameras(rest, (0..problem.cameras).filter_map(lens))
 }
 
 #[cfg(test)]

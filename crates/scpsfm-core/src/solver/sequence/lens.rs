@@ -8,7 +8,7 @@
 use std::f64::consts::SQRT_2;
 
 use super::projective::{self, ProjectiveReconstruction};
-use super::{Ended, QUICK_SEED};
+use super::{Ended, Extended, QUICK_SEED};
 use crate::geometry::bundle::metric::Intrinsics;
 use crate::geometry::homography;
 use crate::solver::problem::{Problem, Undone};
@@ -45,10 +45,18 @@ const OPTIONS: LensSearchOptions = LensSearchOptions::DEFAULT;
 /// Unknowns of the homography between two views.
 const HOMOGRAPHY_UNKNOWNS: usize = 8;
 
-/// Whether the answer behind lenses replaces the one without: it must explain nearly as much, so that a calibration of
-/// a part does not replace a reconstruction of the whole.
-pub fn replaces(evidence: f64, of_pinholes: f64) -> bool {
+/// Whether an answer behind lenses explains nearly as much as the one without: a calibration of a part is not to replace
+/// a reconstruction of the whole.
+pub fn explains_enough(evidence: f64, of_pinholes: f64) -> bool {
     evidence > OPTIONS.least_kept * of_pinholes
+}
+
+/// Undoes the lenses that were calibrated in place of those that were sampled; whether any distorts. What a sample is
+/// off by looks like parallax where a camera only turns, and only a part of the tracks fits that.
+pub fn undo_found(problem: &mut Problem, calibrated: &Extended) -> bool {
+    let lenses = calibrated.model.lenses.iter().map(|lens| lens.intrinsics);
+    problem.undone = Undone::of_cameras(problem, lenses.enumerate());
+    problem.undone.is_some()
 }
 
 /// Undoes the lenses that explain quick seeds of each camera better than pinholes do, where pinholes give no

@@ -59,7 +59,8 @@ pub enum Ended {
 }
 
 /// Solves an input. Where pinholes give no calibration of most views, solves it once more with the lenses undone that
-/// explain seeds better; these stay undone in the problem where that answer stands.
+/// explain seeds better, and where that calibrates a part, with the lenses undone that were calibrated; what is undone
+/// stays so in the problem where that answer stands.
 ///
 /// # Errors
 /// [`Error::Stopped`]; [`Error::Internal`] for defects.
@@ -69,10 +70,14 @@ pub fn solve(problem: &mut Problem, recorder: &mut Recorder) -> Result<Ended, Er
         return Ok(ended);
     }
     let found = of_blocks(problem, recorder)?;
-    // The calibration of a block takes the undone lens as exact; only an extension adjusts it in the images.
-    let is_extended = matches!(found, Ended::Extended(_)) && found.is_calibrated(problem);
-    if is_extended && lens::replaces(found.evidence(problem), ended.evidence(problem)) {
+    if found.replaces(&ended, problem) {
         return Ok(found);
+    }
+    if found.calibrated_extension(problem).is_some_and(|calibrated| lens::undo_found(problem, calibrated)) {
+        let found = of_blocks(problem, recorder)?;
+        if found.replaces(&ended, problem) {
+            return Ok(found);
+        }
     }
     problem.undone = None;
     Ok(ended)
@@ -189,11 +194,19 @@ impl Ended {
         }
     }
 
-    fn is_calibrated(&self, problem: &Problem) -> bool {
+    /// The extension that carries the calibration; `None` where there is none. The calibration of a block takes an
+    /// undone lens as exact; only an extension adjusts it in the images.
+    fn calibrated_extension(&self, problem: &Problem) -> Option<&Extended> {
         match self {
-            Ended::Extended(extended) => extended.is_calibrated(problem),
-            Ended::Block(attempt) => attempt.as_ref().is_some_and(|attempt| attempt.is_calibrated()),
+            Ended::Extended(extended) => Some(&**extended).filter(|extended| extended.is_calibrated(problem)),
+            Ended::Block(_) => None,
         }
+    }
+
+    /// Whether this answer behind lenses replaces one without.
+    fn replaces(&self, of_pinholes: &Self, problem: &Problem) -> bool {
+        self.calibrated_extension(problem).is_some()
+            && lens::explains_enough(self.evidence(problem), of_pinholes.evidence(problem))
     }
 
     /// How well the observations fit, see [`projective::evidence`].

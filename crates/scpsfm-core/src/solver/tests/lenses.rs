@@ -137,6 +137,37 @@ fn several_cameras_that_are_declared_as_one_are_not_metric_without_a_warning() {
     }
 }
 
+/// What fits behind the seed's pinhole is not what fits behind the lens: of two cameras on a drive.
+#[test]
+fn a_strong_lens_is_calibrated_from_what_fits_behind_it() {
+    for seed in 0..3 {
+        let options = PhotographedOptions {
+            views: 16,
+            motion: PhotographedMotion::Drive,
+            turn_rad: PhotographedOptions::drawn(seed).turn_rad,
+            lens: LensKind::ActionCamera,
+            focal_px: 1100.0,
+            focal: FocalKind::TwoGroups,
+            radial: [-0.25, 0.05],
+            wrong_share: 0.2,
+            ..fisheye(PhotographedMotion::Drive, seed)
+        };
+        let scene = Photographed::generate(&options).expect("valid options");
+        let input = Input::new(scene.input.clone(), &Limits::default(), "scene").expect("valid input");
+        let solution = solved(&input, &SolveSettings::default());
+        println!("seed {seed}: {:?} {:?}", solution.grade, solution.warnings);
+        assert_eq!(solution.grade, Some(Grade::Metric), "seed {seed}");
+        for (group, calibration) in solution.cameras() {
+            let calibration = calibration.expect("calibrated");
+            let view = solution.views.iter().position(|view| view.camera_group == group).expect("a view of it");
+            let error = (calibration.focal_px / scene.truth.focals_px[view]).ln().abs();
+            let sigma = calibration.sigma_log_focal.expect("observable");
+            println!("  group {group}: off by {error:.5}, sigma {sigma:.5}");
+            assert!(error < 3.0 * sigma, "seed {seed}, group {group}: {error} for {sigma}");
+        }
+    }
+}
+
 /// Ten views behind an equidistant fisheye of 150 degrees, three of ten tracks wrong.
 fn fisheye(motion: PhotographedMotion, seed: u64) -> PhotographedOptions {
     PhotographedOptions {
