@@ -50,6 +50,11 @@ impl Grade {
             _ => Grade::Metric,
         }
     }
+
+    /// Whether it promises no less.
+    pub fn is_no_worse_than(self, other: Self) -> bool {
+        self.worse(other) == other
+    }
 }
 
 /// What proposed the tracks that the accepted hypothesis was sampled from.

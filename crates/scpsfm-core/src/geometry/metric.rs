@@ -1,4 +1,4 @@
-//! From a projective to a metric reconstruction, given the DAQ.
+//! From a projective to a metric reconstruction, given the DAQ; what a metric one is asked and mended by.
 
 use nalgebra::{Matrix3, Matrix4, Vector3, Vector4};
 
@@ -144,29 +144,39 @@ pub fn cheirality(reconstruction: &MetricReconstruction, observations: &[Observa
     if count > 0 { front as f64 / count as f64 } else { 0.0 }
 }
 
-/// Moves points to where the cameras see them, where they cost less there; how many it moved.
+/// Triangulates some points anew from the cameras, where that lowers their cost; how many moved.
 ///
-/// * `which`: one a point, those that may move
-pub fn retriangulate(reconstruction: &mut MetricReconstruction, observations: &[Observation], which: &[bool]) -> usize {
-    if !which.contains(&true) {
+/// * `may_move`: one a point
+///
+/// # Panics
+/// When the group of a view is out of range.
+pub fn retriangulate(
+    reconstruction: &mut MetricReconstruction,
+    observations: &[Observation],
+    may_move: &[bool],
+) -> usize {
+    if !may_move.contains(&true) {
         return 0;
     }
     let mut of_point = vec![Vec::new(); reconstruction.points.len()];
-    let counts = |seen: &&Observation| which.get(seen.point) == Some(&true);
-    for seen in observations.iter().filter(counts) {
+    for seen in observations.iter().filter(|seen| may_move.get(seen.point) == Some(&true)) {
         if seen.is_usable(reconstruction.poses.len(), of_point.len()) {
             of_point[seen.point].push(*seen);
         }
     }
     let cameras = reconstruction.cameras();
     let mut moved = 0;
-    for (point, seen) in of_point.iter().enumerate().filter(|(_, seen)| !seen.is_empty()) {
+    for (point, seen) in of_point.iter().enumerate() {
         let pinhole = |seen: &Observation| reconstruction.intrinsics_of(seen.view).undistorted(seen);
         let undistorted: Vec<Observation> = seen.iter().filter_map(pinhole).collect();
+        // One observation fits a point at any depth.
+        if undistorted.len() < 2 {
+            continue;
+        }
         let homogeneous = triangulation::linear(&cameras, &undistorted);
         let position: Vector3<f64> = homogeneous.xyz() / homogeneous.w;
         let cost = |reconstruction: &MetricReconstruction| -> f64 {
-            seen.iter().map(|seen| seen.weight * reconstruction.residual(seen).norm_squared()).sum()
+            seen.iter().map(|seen| reconstruction.weighted_squared(seen)).sum()
         };
         let before = cost(reconstruction);
         let former = std::mem::replace(&mut reconstruction.points[point], position);
@@ -182,10 +192,12 @@ pub fn retriangulate(reconstruction: &mut MetricReconstruction, observations: &[
 
 #[cfg(test)]
 mod tests {
-    use super::super::bundle::testing;
+    use super::super::bundle::metric::{IntrinsicsModel, IntrinsicsPrior, adjust};
+    use super::super::bundle::{Options, testing};
     use super::super::daq::to_canonical_frame;
     use super::super::daq::{Free, refine, scan};
     use super::*;
+    use crate::domain::StopToken;
 
     #[test]
     fn upgrades_an_exact_reconstruction_exactly() {
@@ -207,29 +219,35 @@ mod tests {
         }
     }
 
-    /// Far out, behind the cameras or not a number, behind a lens or not; and what may not move, or fits already, stays.
+    /// Far out, behind the cameras or not a number, behind a lens or not. What is at its minimum stays, and what may not
+    /// move.
     #[test]
-    fn points_that_went_astray_are_put_back() {
+    fn diverged_points_are_triangulated_anew() {
         for (seed, radial_k1) in [(0, 0.0), (1, -0.2)] {
             let mut scene = testing::scene(seed, 6, 20, 0.0);
             scene.intrinsics.radial[0] = radial_k1;
-            scene.observe(0.0, &mut rand::SeedableRng::seed_from_u64(seed));
-            let right = scene.reconstruction();
-            let mut astray = right.clone();
-            astray.points[1] *= 1e7;
-            astray.points[2] = -astray.points[2];
-            astray.points[3].x = f64::NAN;
-            astray.points[4] *= 2.0;
-            let which: Vec<bool> = (0..20).map(|point| point != 4).collect();
-            assert!(retriangulate(&mut astray, &scene.observations, &which) >= 3, "seed {seed}");
-            assert_eq!(astray.points[4], right.points[4] * 2.0, "seed {seed}");
-            for point in (0..20).filter(|point| *point != 4) {
-                let error = (astray.points[point] - right.points[point]).norm();
-                assert!(error < 1e-6, "seed {seed}, point {point}: {error}");
+            scene.observe(1e-4, &mut rand::SeedableRng::seed_from_u64(seed));
+            let mut right = scene.reconstruction();
+            let (model, priors) = (IntrinsicsModel::FIXED, [IntrinsicsPrior::NONE]);
+            let options = Options { relative_tolerance: 1e-14, ..Options::squared(50) };
+            adjust(&mut right, &scene.observations, model, &priors, &options, &StopToken::default());
+            let mut found = right.clone();
+            found.points[1] *= 1e7;
+            found.points[2] = -found.points[2];
+            found.points[3].x = f64::NAN;
+            found.points[4] *= 2.0;
+            let may_move: Vec<bool> = (0..20).map(|point| point != 4).collect();
+            assert_eq!(retriangulate(&mut found, &scene.observations, &may_move), 3, "seed {seed}");
+            assert_eq!(found.points[4], right.points[4] * 2.0, "seed {seed}");
+            for point in [1, 2, 3] {
+                let error = (found.points[point] - right.points[point]).norm();
+                assert!(error < 0.01, "seed {seed}, point {point}: {error}");
             }
-            let before = astray.clone();
-            assert_eq!(retriangulate(&mut astray, &[], &which), 0);
-            assert_eq!(astray.points, before.points);
+            assert_eq!(found.points[5..], right.points[5..], "seed {seed}");
+            // One observation tells no depth.
+            let before = found.clone();
+            assert_eq!(retriangulate(&mut found, &scene.observations[..1], &[true; 20]), 0, "seed {seed}");
+            assert_eq!(found.points, before.points, "seed {seed}");
         }
     }
 

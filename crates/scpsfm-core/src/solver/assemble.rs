@@ -93,8 +93,8 @@ impl Assembled {
     /// tracks, and graded no worse. A calibration is of the camera, whatever moved before it.
     fn may_replace(&self, other: &Self) -> bool {
         let inliers = self.judged.tracks.inlier.iter().filter(|&&inlier| inlier).count();
-        let [own, grade] = [self, other].map(|one| one.reconstruction.grade);
-        inliers >= LEAST_INLIERS && !self.reconstruction.geometry.of_static && own.worse(grade) == grade
+        let [own, others] = [self, other].map(|one| one.reconstruction.grade);
+        inliers >= LEAST_INLIERS && !self.reconstruction.geometry.of_static && own.is_no_worse_than(others)
     }
 }
 

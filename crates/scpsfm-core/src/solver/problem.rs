@@ -79,27 +79,34 @@ pub struct Undone {
 }
 
 impl Undone {
-    /// This lens of a camera undone beside what is undone already; `None` where it does not image all of its
-    /// observations.
-    pub fn new(problem: &Problem, already: Option<&Self>, camera: usize, lens: Intrinsics) -> Option<Self> {
-        let pinholes = || vec![Intrinsics::from_focal(1.0); problem.cameras];
-        let mut lenses = already.map_or_else(pinholes, |undone| undone.lenses.clone());
-        lenses[camera] = lens;
+    /// These lenses of cameras undone in place of what is undone already; a lens that does not image all observations of
+    /// its camera is not. `None` where nothing is undone.
+    pub fn new(
+        problem: &Problem,
+        already: Option<&Self>,
+        changed: impl IntoIterator<Item = (usize, Intrinsics)>,
+    ) -> Option<Self> {
+        let pinholes = vec![Intrinsics::from_focal(1.0); problem.cameras];
+        let before = already.map_or(pinholes, |undone| undone.lenses.clone());
+        let mut lenses = before.clone();
+        changed.into_iter().for_each(|(camera, lens)| lenses[camera] = lens);
         let camera_of = |k: usize| problem.camera_of[problem.view_of(k)];
-        let undone = |k: usize| lenses[camera_of(k)].undistorted(&problem.observation(k));
-        let observations = (0..problem.xy.len()).map(undone).collect::<Option<Vec<Observation>>>()?;
+        let undistorted = |lenses: &[Intrinsics], k: usize| lenses[camera_of(k)].undistorted(&problem.observation(k));
+        for k in 0..problem.xy.len() {
+            if undistorted(&lenses, k).is_none() {
+                lenses[camera_of(k)] = before[camera_of(k)];
+            }
+        }
+        if !lenses.iter().any(Intrinsics::distorts) {
+            return None;
+        }
+        let observations = (0..problem.xy.len()).map(|k| undistorted(&lenses, k)).collect::<Option<_>>()?;
         let mut radii = vec![0.0f64; problem.cameras];
         for (k, xy) in problem.xy.iter().enumerate() {
             let radius = &mut radii[camera_of(k)];
             *radius = radius.max(xy.norm());
         }
         Some(Self { lenses, radii, observations })
-    }
-
-    /// The lenses of some cameras undone, as far as they distort and image all observations; `None` where none is.
-    pub fn of_cameras(problem: &Problem, lenses: impl IntoIterator<Item = (usize, Intrinsics)>) -> Option<Self> {
-        let distorting = lenses.into_iter().filter(|(_, lens)| lens.distorts());
-        distorting.fold(None, |undone, (camera, lens)| Self::new(problem, undone.as_ref(), camera, lens).or(undone))
     }
 
     /// The lens of the images of a camera for which these intrinsics are found once its lens is undone.

@@ -159,7 +159,7 @@ fn lenses(problem: &Problem, geometry: &Geometry, rest: &Problem) -> Option<Undo
         let view = (0..problem.views()).find(is_of)?;
         Some((camera, *geometry.lenses.get(view)?))
     };
-    Undone::of_cameras(rest, (0..problem.cameras).filter_map(lens))
+    Undone::new(rest, None, (0..problem.cameras).filter_map(lens))
 }
 
 #[cfg(test)]

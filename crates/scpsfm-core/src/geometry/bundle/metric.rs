@@ -206,6 +206,14 @@ impl MetricReconstruction {
     pub fn residual(&self, seen: &Observation) -> Vector2<f64> {
         self.intrinsics_of(seen.view).project(&self.poses[seen.view].apply(&self.points[seen.point])) - seen.xy
     }
+
+    /// The squared residual by the observation's weight.
+    ///
+    /// # Panics
+    /// As [`Self::residual`].
+    pub fn weighted_squared(&self, seen: &Observation) -> f64 {
+        seen.weight * self.residual(seen).norm_squared()
+    }
 }
 
 /// Minimises the reprojection error over poses, points and the free intrinsics, the same of every camera group, of

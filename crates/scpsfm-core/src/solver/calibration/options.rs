@@ -134,10 +134,9 @@ options! {
         /// Adjusted starts this near in log focal, and within this share in cost, are the same minimum.
         same_minimum: f64 = 0.01,
         same_cost: f64 = 0.1,
-        /// Mean squared residual of a point, in that of all observations, above which it may have gone astray: noise
-        /// takes one point of three views in ten million so far. It is moved only where it costs less, so that a
-        /// lower bound would cost time and nothing else.
-        astray_above: f64 = 10.0,
+        /// Mean squared residual of a point, in the median of all points, above which it may have diverged. Noise takes
+        /// one point of three views in 30,000 so far; such a point is triangulated and stays where that costs more.
+        diverged_above: f64 = 10.0,
         /// Points that take part in the search: more tell no minimum from another that these do not.
         points: usize = 150,
         /// Points below which the search does not thin out a view.

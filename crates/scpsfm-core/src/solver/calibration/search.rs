@@ -14,7 +14,7 @@ use crate::geometry::bundle::{Options, Report};
 use crate::geometry::daq::{self, CanonicalFrame, Daq, Free};
 use crate::geometry::metric::{cheirality, retriangulate, upgrade, upgrade_translation};
 use crate::geometry::observation::Observation;
-use crate::geometry::statistics::root_mean_square;
+use crate::geometry::statistics::{median, root_mean_square};
 
 /// A converged metric reconstruction.
 #[derive(Debug, Clone)]
@@ -130,34 +130,34 @@ impl Search<'_> {
         Ok(distinct(found, self.problem))
     }
 
-    /// Adjusts, and once more where points that went astray were put back.
+    /// Adjusts, and once more where points that diverged were triangulated anew.
     fn converge(&self, options: &Options, start: MetricReconstruction, model: IntrinsicsModel) -> (Minimum, Report) {
         let (mut minimum, report) = self.run(options, start, model);
-        let again = !report.is_hopeless && self.put_back(&mut minimum);
+        let again = !report.is_hopeless && self.retriangulate_diverged(&mut minimum.reconstruction);
         if again { self.run(options, minimum.reconstruction, model) } else { (minimum, report) }
     }
 
-    /// Puts the points back that went astray on the way to a minimum; whether there were any.
+    /// Triangulates the points anew that diverged on the way to a minimum; whether any moved.
     ///
-    /// A step may take a point past infinity, or so far out that nothing leads it back. It then costs many times what
-    /// others do, and lens and poses give way to it.
-    fn put_back(&self, minimum: &mut Minimum) -> bool {
-        let (reconstruction, observations) = (&mut minimum.reconstruction, self.problem.observations);
+    /// A step may take a point past infinity, or so far out that no gradient leads it back. It then costs many times
+    /// what others do, and lens and poses give way to it.
+    fn retriangulate_diverged(&self, reconstruction: &mut MetricReconstruction) -> bool {
         if reconstruction.has_common_centre {
             return false;
         }
-        let mean = minimum.cost / observations.len() as f64;
         let (views, points) = (reconstruction.poses.len(), reconstruction.points.len());
-        let mut costs = vec![(0.0, 0.0); points];
-        for seen in observations.iter().filter(|seen| seen.is_usable(views, points)) {
-            let (cost, count) = &mut costs[seen.point];
-            *cost += seen.weight * reconstruction.residual(seen).norm_squared();
+        let mut sums = vec![(0.0, 0.0); points];
+        for seen in self.problem.observations.iter().filter(|seen| seen.is_usable(views, points)) {
+            let (cost, count) = &mut sums[seen.point];
+            *cost += reconstruction.weighted_squared(seen);
             *count += 1.0;
         }
-        // Written so that NaN counts as astray.
-        let in_place = |(cost, count): (f64, f64)| cost <= self.problem.options.search.astray_above * mean * count;
-        let astray: Vec<bool> = costs.into_iter().map(|cost| !in_place(cost)).collect();
-        retriangulate(reconstruction, observations, &astray) > 0
+        let mut observed: Vec<f64> = sums.iter().filter(|(_, count)| *count > 0.0).map(|(cost, n)| cost / n).collect();
+        let limit = self.problem.options.search.diverged_above * median(&mut observed);
+        // Written so that NaN counts as diverged.
+        let has_diverged = |(cost, count): (f64, f64)| count > 0.0 && !matches!(cost / count, mean if mean <= limit);
+        let diverged: Vec<bool> = sums.into_iter().map(has_diverged).collect();
+        retriangulate(reconstruction, self.problem.observations, &diverged) > 0
     }
 
     fn adjusted(&self, options: &Options, start: MetricReconstruction, model: IntrinsicsModel) -> Minimum {

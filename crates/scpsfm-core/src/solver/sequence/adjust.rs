@@ -107,7 +107,7 @@ impl Extract {
 
     /// Squared residuals, times the weights of the observations.
     pub fn squared_residuals(&self) -> Vec<f64> {
-        let squared = |seen: &Observation| seen.weight * self.sequence.residual(seen).norm_squared();
+        let squared = |seen: &Observation| self.sequence.weighted_squared(seen);
         self.observations.iter().map(squared).collect()
     }
 

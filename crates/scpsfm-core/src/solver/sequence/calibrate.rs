@@ -5,7 +5,7 @@ use nalgebra::Vector3;
 use super::adjust::{self, Extract};
 use super::model::Model;
 use super::options::StretchOptions;
-use super::{own_focals, windows};
+use super::{own_focals, structure, windows};
 use crate::domain::{FocalPrior, Grade, Task, Warning, WarningCode};
 use crate::geometry::bundle::metric::{Intrinsics, MetricReconstruction};
 use crate::geometry::observation::Observation;
@@ -23,9 +23,9 @@ const OFF_CENTRE: f64 = 0.01;
 /// Calibrates each camera from the landmarks and observations that fit best, takes the models over, adjusts everything
 /// under them and asks the windows; one outcome a camera.
 ///
-/// What fits best is judged behind the lens that the seed had. Where all observations, behind the lens that was found,
-/// lead to another focal length than the calibration gives, everything is calibrated a second time, from what fits best
-/// there.
+/// The observations are those that fit behind the seed's lens. Where the adjustment of all observations moves a focal
+/// length by more than its sigma, everything is calibrated a second time, from what fits behind the adjusted lens. The
+/// second calibration is used unless it grades a camera worse, or the views no longer hold together.
 ///
 /// # Errors
 /// [`Error::Stopped`].
@@ -33,11 +33,12 @@ pub fn calibrate(problem: &Problem, model: &mut Model, recorder: &mut Recorder) 
     if problem.has_own_focals() {
         return own_focals::calibrate(problem, model, recorder).map(|outcome| vec![outcome]);
     }
-    let mut found = Calibrated::of_registered(problem, model, recorder)?;
-    if found.has_moved {
+    let mut found = calibrate_registered(problem, model, 0, recorder)?;
+    if found.focal_moved {
         let mut again = model.clone();
-        let second = Calibrated::of_registered(problem, &mut again, recorder)?;
-        if second.is_nowhere_worse_than(&found) {
+        structure::triangulate(problem, &mut again, recorder);
+        let second = calibrate_registered(problem, &mut again, 1, recorder)?;
+        if second.is_nowhere_worse_than(&found) && (model.is_strained || !again.is_strained) {
             (*model, found) = (again, second);
         }
     }
@@ -48,63 +49,75 @@ pub fn calibrate(problem: &Problem, model: &mut Model, recorder: &mut Recorder) 
     Ok(found.outcomes)
 }
 
-/// What was found of all cameras.
+/// The calibrations of all cameras.
 struct Calibrated {
     /// One a camera, with a sigma that admits what lies between its focal length and that of the model.
     outcomes: Vec<Outcome>,
-    /// Whether that is more than the sigma of a calibration that was not refused.
-    has_moved: bool,
+    /// Whether the adjustment of all observations moved a focal length by more than the sigma of its calibration.
+    focal_moved: bool,
 }
 
 impl Calibrated {
-    /// Calibrates the cameras of all registered views, takes the models over and adjusts everything under them.
-    fn of_registered(problem: &Problem, model: &mut Model, recorder: &mut Recorder) -> Result<Self, Error> {
-        let runs = runs(problem, model);
-        let mut outcomes: Vec<Outcome> = (0..problem.cameras).map(|_| too_few(0)).collect();
-        for (k, views) in runs.iter().enumerate() {
-            recorder.step(Task::Cameras, k + 1, runs.len(), 0.0);
-            let found = match views.len() < view_selection::LEAST_VIEWS {
-                true => views.iter().map(|&view| (problem.camera_of[view], too_few(views.len()))).collect(),
-                false => of_cameras(problem, model, views, recorder)?,
-            };
-            found.into_iter().for_each(|(camera, outcome)| outcomes[camera] = outcome);
-        }
-        super::structure::triangulate(problem, model, recorder);
-        adjust::all(problem, model, recorder);
-        let mut found = Self { outcomes, has_moved: false };
-        for (camera, outcome) in found.outcomes.iter_mut().enumerate() {
-            let (Some(graded), Some(sigma)) = (outcome.intrinsics(), outcome.sigma_log_focal) else { continue };
-            let difference = (model.lenses[camera].intrinsics.focal / graded.focal).ln().abs();
-            if difference > sigma {
-                found.has_moved |= outcome.grade != Grade::ProjectiveOnly;
-                outcome.raise_sigma(difference, &problem.calibration_options.grades);
-            }
-        }
-        Ok(found)
-    }
-
-    /// Whether no camera has a worse grade.
     fn is_nowhere_worse_than(&self, other: &Self) -> bool {
         let mut pairs = self.outcomes.iter().zip(&other.outcomes);
-        pairs.all(|(own, other)| own.grade.worse(other.grade) == other.grade)
+        pairs.all(|(own, other)| own.grade.is_no_worse_than(other.grade))
     }
 }
 
-/// Registered views whose cameras are calibrated together: all, where they are few or a stretch of them holds enough of
-/// each camera for a comparison with projective cameras; else those of each camera by itself.
-fn runs(problem: &Problem, model: &Model) -> Vec<Vec<usize>> {
+/// Calibrates the cameras of all registered views, takes the models over and adjusts everything under them.
+///
+/// All cameras are calibrated together where they have few views, or the stretch of their views that is compared with
+/// projective cameras holds enough of each. Where that calibrates none (the stretch may be critical), each is calibrated
+/// by itself.
+///
+/// * `pass`: how many times they were calibrated before
+fn calibrate_registered(
+    problem: &Problem,
+    model: &mut Model,
+    pass: usize,
+    recorder: &mut Recorder,
+) -> Result<Calibrated, Error> {
     let registered = model.registered();
-    let of_camera = |views: &[usize], camera: usize| -> Vec<usize> {
-        views.iter().copied().filter(|&view| problem.camera_of[view] == camera).collect()
+    let mut of_camera = vec![Vec::new(); problem.cameras];
+    registered.iter().for_each(|&view| of_camera[problem.camera_of[view]].push(view));
+    let is_long = registered.len() > OPTIONS.most_views;
+    let stretch = is_long.then(|| densest(problem, model, &registered));
+    let holds_enough = |views: &Vec<usize>| {
+        let of_stretch = |stretch: &Vec<usize>| views.iter().filter(|view| stretch.binary_search(view).is_ok()).count();
+        views.is_empty() || stretch.as_ref().is_none_or(|stretch| of_stretch(stretch) >= OPTIONS.least_of_camera)
     };
-    let stretch = densest(problem, model, &registered);
-    let holds_enough = |camera: usize| {
-        of_camera(&registered, camera).is_empty() || of_camera(&stretch, camera).len() >= view_selection::LEAST_VIEWS
-    };
-    match registered.len() <= OPTIONS.most_views || (0..problem.cameras).all(holds_enough) {
-        true => vec![registered],
-        false => (0..problem.cameras).map(|camera| of_camera(&registered, camera)).collect(),
+    let mut found = Vec::new();
+    if registered.len() >= view_selection::LEAST_VIEWS && of_camera.iter().all(holds_enough) {
+        recorder.step(Task::Cameras, pass + 1, pass + 1, 0.0);
+        found.push(of_run(problem, model, &registered, stretch.as_deref(), recorder)?);
     }
+    let mut graded = found.iter().flat_map(|(_, outcomes)| outcomes);
+    if is_long && problem.cameras > 1 && graded.all(|(_, outcome)| outcome.grade == Grade::ProjectiveOnly) {
+        found.clear();
+        let runs = of_camera.iter().filter(|views| views.len() >= view_selection::LEAST_VIEWS);
+        for (k, views) in runs.enumerate() {
+            recorder.step(Task::Cameras, pass * problem.cameras + k + 1, (pass + 1) * problem.cameras, 0.0);
+            let stretch = (views.len() > OPTIONS.most_views).then(|| densest(problem, model, views));
+            found.push(of_run(problem, model, views, stretch.as_deref(), recorder)?);
+        }
+    }
+    let mut outcomes: Vec<Outcome> = of_camera.iter().map(|views| too_few(views.len())).collect();
+    for (mut extract, of_run) in found {
+        take_over(model, &mut extract, &of_run);
+        of_run.into_iter().for_each(|(camera, outcome)| outcomes[camera] = outcome);
+    }
+    structure::triangulate(problem, model, recorder);
+    adjust::all(problem, model, recorder);
+    let mut focal_moved = false;
+    for (camera, outcome) in outcomes.iter_mut().enumerate() {
+        let (Some(graded), Some(sigma)) = (outcome.intrinsics(), outcome.sigma_log_focal) else { continue };
+        let difference = (model.lenses[camera].intrinsics.focal / graded.focal).ln().abs();
+        if difference > sigma {
+            focal_moved |= outcome.grade != Grade::ProjectiveOnly;
+            outcome.raise_sigma(difference, &problem.calibration_options.grades);
+        }
+    }
+    Ok(Calibrated { outcomes, focal_moved })
 }
 
 /// Reports the points and the focal length, a mean where views have their own, of the first camera with registered
@@ -125,21 +138,20 @@ pub fn too_few(views: usize) -> Outcome {
     Outcome::refused(vec![Warning::new(WarningCode::UnobservableFocal, detail)])
 }
 
-/// The calibrations of the cameras of these views, whose views have one focal length each.
-fn of_cameras(
+/// The calibrations of the cameras of these views, whose views have one focal length each, with what they are made from.
+///
+/// * `stretch`: as of [`of_extract`]
+fn of_run(
     problem: &Problem,
-    model: &mut Model,
+    model: &Model,
     views: &[usize],
+    stretch: Option<&[usize]>,
     recorder: &mut Recorder,
-) -> Result<Vec<(usize, Outcome)>, Error> {
-    let mut extract = core(problem, model, views, of_view(views));
-    let stretch = (views.len() > OPTIONS.most_views).then(|| {
-        let stretch = densest(problem, model, views);
-        core(problem, model, &stretch, of_view(&stretch))
-    });
+) -> Result<(Extract, Vec<(usize, Outcome)>), Error> {
+    let extract = core(problem, model, views, of_view(views));
+    let stretch = stretch.map(|stretch| core(problem, model, stretch, of_view(stretch)));
     let found = of_extract(problem, &extract, stretch.as_ref(), model.noise, &mut || recorder.heartbeat())?;
-    take_over(model, &mut extract, &found);
-    Ok(found)
+    Ok((extract, found))
 }
 
 /// The calibrations of the cameras of some views.
@@ -257,11 +269,8 @@ pub fn core(problem: &Problem, model: &Model, views: &[usize], of_view: usize) -
     let tracks = adjust::covering(problem, model, views, of_view);
     let mut extract = Extract::new(problem, model, views, &tracks);
     let limit = OPTIONS.core_squared * model.noise * model.noise;
-    let fits: Vec<bool> = extract
-        .observations
-        .iter()
-        .map(|seen| seen.weight * extract.sequence.residual(seen).norm_squared() < limit)
-        .collect();
+    let fits: Vec<bool> =
+        extract.observations.iter().map(|seen| extract.sequence.weighted_squared(seen) < limit).collect();
     let mut kept = vec![0usize; extract.tracks.len()];
     for (seen, fits) in extract.observations.iter().zip(&fits) {
         kept[seen.point] += usize::from(*fits);
@@ -269,4 +278,27 @@ pub fn core(problem: &Problem, model: &Model, views: &[usize], of_view: usize) -
     let mut fits = fits.into_iter();
     extract.observations.retain(|seen| fits.next().unwrap_or(false) && kept[seen.point] >= VERIFIED);
     extract
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_second_calibration_that_grades_any_camera_worse_is_not_used() {
+        let graded = |grades: [Grade; 2]| Calibrated {
+            outcomes: grades.map(|grade| Outcome { grade, ..Outcome::refused(Vec::new()) }).to_vec(),
+            focal_moved: true,
+        };
+        let (metric, weak, none) = (Grade::Metric, Grade::Weak, Grade::ProjectiveOnly);
+        for (second, first, is_used) in [
+            ([metric, weak], [metric, weak], true),
+            ([metric, metric], [metric, weak], true),
+            ([metric, metric], [none, none], true),
+            ([weak, metric], [metric, weak], false),
+            ([none, metric], [weak, metric], false),
+        ] {
+            assert_eq!(graded(second).is_nowhere_worse_than(&graded(first)), is_used, "{second:?} after {first:?}");
+        }
+    }
 }

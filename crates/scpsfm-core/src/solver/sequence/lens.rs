@@ -3,14 +3,17 @@
 //!
 //! Sampled lenses serve as well as minimal solvers with a lens parameter (Tzamos, Kocur, Ding, Sattler & Kukelova
 //! 2024). With weak distortion a pinhole's seed suffices. With strong distortion it is small or wrong, and a plane or a
-//! turning camera looks like a scene with depth.
+//! turning camera looks like a scene with depth. Where that calibrates a part of the scene, the input is searched once
+//! more, behind the lenses that were calibrated.
 
 use std::f64::consts::SQRT_2;
 
 use super::projective::{self, ProjectiveReconstruction};
 use super::{Ended, Extended, QUICK_SEED};
+use crate::domain::Grade;
 use crate::geometry::bundle::metric::Intrinsics;
 use crate::geometry::homography;
+use crate::solver::calibration::Outcome;
 use crate::solver::problem::{Problem, Undone};
 use crate::solver::recorder::Recorder;
 use crate::solver::{Error, attempt, view_selection};
@@ -51,12 +54,22 @@ pub fn explains_enough(evidence: f64, of_pinholes: f64) -> bool {
     evidence > OPTIONS.least_kept * of_pinholes
 }
 
-/// Undoes the lenses that were calibrated in place of those that were sampled; whether any distorts. What a sample is
-/// off by looks like parallax where a camera only turns, and only a part of the tracks fits that.
-pub fn undo_found(problem: &mut Problem, calibrated: &Extended) -> bool {
-    let lenses = calibrated.model.lenses.iter().map(|lens| lens.intrinsics);
-    problem.undone = Undone::of_cameras(problem, lenses.enumerate());
-    problem.undone.is_some()
+/// Undoes the lenses that an extension calibrated, each in place of a sampled one; whether there is any. A sampled lens
+/// is off by some per cent. Where a camera only turns, that error looks like parallax, and only some tracks fit it.
+pub fn undo_calibrated(problem: &mut Problem, extended: &Extended) -> bool {
+    let calibrated = |(camera, outcome): (usize, &Outcome)| {
+        let lens = extended.model.lenses[camera];
+        let stands = lens.is_known && outcome.grade != Grade::ProjectiveOnly && outcome.metric.is_some();
+        stands.then_some((camera, lens.intrinsics))
+    };
+    let lenses: Vec<_> = extended.calibrations.iter().enumerate().filter_map(calibrated).collect();
+    if lenses.is_empty() {
+        return false;
+    }
+    let found = Undone::new(problem, problem.undone.as_ref(), lenses);
+    let is_any = found.is_some();
+    problem.undone = found.or(problem.undone.take());
+    is_any
 }
 
 /// Undoes the lenses that explain quick seeds of each camera better than pinholes do, where pinholes give no
@@ -118,7 +131,7 @@ impl Best {
         sets: &[Vec<usize>],
         recorder: &mut Recorder,
     ) -> Result<(), Error> {
-        problem.undone = Undone::new(problem, without, camera, Intrinsics::equidistant(focal));
+        problem.undone = Undone::new(problem, without, [(camera, Intrinsics::equidistant(focal))]);
         if problem.undone.is_none() {
             return Ok(());
         }

@@ -73,7 +73,8 @@ pub fn solve(problem: &mut Problem, recorder: &mut Recorder) -> Result<Ended, Er
     if found.replaces(&ended, problem) {
         return Ok(found);
     }
-    if found.calibrated_extension(problem).is_some_and(|calibrated| lens::undo_found(problem, calibrated)) {
+    if found.calibrated_extension(problem).is_some_and(|extended| lens::undo_calibrated(problem, extended)) {
+        drop(found);
         let found = of_blocks(problem, recorder)?;
         if found.replaces(&ended, problem) {
             return Ok(found);

@@ -25,9 +25,10 @@ pub fn reconcile(
     let (estimates, shared) = estimates(problem, model, camera, recorder)?;
     let Some(fused) = fuse(&estimates, shared) else { return Ok(()) };
     let apart = fused.log_focal - model.log_focal(camera, &of_camera(problem, model, camera));
-    let beyond = |value: f64| of_whole(value, own, fused.formal);
+    // The windows' own formal variance is taken off: only what lies beyond it raises the sigma of the whole.
+    let beyond = |value: f64| (value.powi(2) - fused.formal.powi(2)).max(0.0).sqrt();
     // Windows that know little differ, and are apart from the whole, by chance.
-    let by_spread = if fused.differ() { own.hypot(beyond(fused.sigma)) } else { own };
+    let by_spread = if fused.differ() { own.hypot(of_whole(beyond(fused.sigma), own, fused.formal)) } else { own };
     let is_apart = apart.abs() > OPTIONS.significant_distance * fused.formal && beyond(apart) > by_spread;
     let count = estimates.len();
     let (sigma, reason) = match is_apart {
@@ -46,14 +47,15 @@ pub fn reconcile(
     Ok(())
 }
 
-/// What a deviation of the windows' mean says of the whole. Their own formal variance is taken off; and what moves
-/// windows that know little (a few wrong observations, a lens that is a little off) moves the whole by as much less as
-/// it knows more.
+/// What the spread of windows about their mean says of the whole: it is moved by as much less as it knows more. Wrong
+/// observations move an estimate along its weakest directions, in units of its sigma (Birge's ratio). A mean that is off
+/// that of the whole is another matter, and counts in full.
 ///
+/// * `spread`: what the sigma of the mean has beyond the formal one
 /// * `own`: sigma of the whole
-/// * `formal`: sigma of the windows' mean
-fn of_whole(deviation: f64, own: f64, formal: f64) -> f64 {
-    (own / formal).min(1.0) * (deviation.powi(2) - formal.powi(2)).max(0.0).sqrt()
+/// * `formal`: sigma of the mean, were the windows to differ by chance
+fn of_whole(spread: f64, own: f64, formal: f64) -> f64 {
+    spread * (own / formal).min(1.0)
 }
 
 /// Views of a camera that say something of it, increasing.
@@ -161,11 +163,9 @@ mod tests {
 
     #[test]
     fn windows_that_know_little_say_little() {
-        assert_eq!(of_whole(0.01, 0.02, 0.01), 0.0);
-        // As sure as the whole: all that is beyond chance.
-        assert!((of_whole(0.05, 0.03, 0.03) - 0.04).abs() < 1e-12 && (of_whole(0.05, 0.06, 0.03) - 0.04).abs() < 1e-12);
-        // A tenth as sure: a tenth of it.
-        assert!((of_whole(0.05, 0.003, 0.03) - 0.004).abs() < 1e-12);
+        for (own, expected) in [(0.003, 0.004), (0.03, 0.04), (0.06, 0.04)] {
+            assert!((of_whole(0.04, own, 0.03) - expected).abs() < 1e-12, "{own}");
+        }
     }
 
     #[test]

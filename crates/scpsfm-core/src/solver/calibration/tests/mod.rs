@@ -56,15 +56,15 @@ fn the_options_bound_the_grades() {
     assert_eq!(grade(1e-9, 1e-9), Grade::ProjectiveOnly);
 }
 
-/// A point so far out that nothing leads it back is put back, and would else cost many times the noise.
+/// A point so far out that no gradient leads it back is triangulated anew, and would else cost many times the noise.
 #[test]
-fn a_point_that_went_astray_does_not_bend_the_minimum() {
+fn a_diverged_point_does_not_bend_the_minimum() {
     for seed in 0..5 {
         let scene = testing::scene(seed, 6, 40, 1e-3);
         let (cameras, points) = projective_problem(&scene, seed);
-        let converged = |start: &MetricReconstruction, astray_above: f64| {
+        let converged = |start: &MetricReconstruction, diverged_above: f64| {
             let mut options = CalibrationOptions::DEFAULT;
-            options.search.astray_above = astray_above;
+            options.search.diverged_above = diverged_above;
             let problem =
                 Uncalibrated { options: &options, ..of_one_lens(&cameras, &points, &scene.observations, 1e-3) };
             let priors = [IntrinsicsPrior::NONE];
@@ -72,14 +72,14 @@ fn a_point_that_went_astray_does_not_bend_the_minimum() {
             search.converged(start.clone(), IntrinsicsModel::FOCAL)
         };
         let start = scene.reconstruction();
-        let bound = CalibrationOptions::DEFAULT.search.astray_above;
+        let bound = CalibrationOptions::DEFAULT.search.diverged_above;
         let expected = converged(&start, bound);
-        let mut astray = start.clone();
+        let mut diverged = start.clone();
         let centre = start.poses[0].rotation.tr_mul(&-start.poses[0].translation);
         let distance = |point: &usize| (start.points[*point] - centre).norm();
         let farthest = (0..40).max_by(|a, b| distance(a).total_cmp(&distance(b))).expect("points");
-        astray.points[farthest] = centre + (start.points[farthest] - centre) * 1e7;
-        let (found, left) = (converged(&astray, bound), converged(&astray, f64::INFINITY));
+        diverged.points[farthest] = centre + (start.points[farthest] - centre) * 1e7;
+        let (found, left) = (converged(&diverged, bound), converged(&diverged, f64::INFINITY));
         let difference = found.log_focal() - expected.log_focal();
         println!("seed {seed}: {:e}, {:e}, left {:e}; {difference:e}", expected.cost, found.cost, left.cost);
         assert!(left.cost > 3.0 * expected.cost, "seed {seed}");
