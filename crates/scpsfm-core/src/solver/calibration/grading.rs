@@ -71,7 +71,7 @@ pub(super) fn grade(
         } else if let Some(differing) = &differing {
             // What the views' own differ from it by, one focal length for all is wrong by.
             sigma = sigma.map(|sigma| sigma.max(differing.shift));
-            verdict.doubt(sigma, differing_words(differing, choice.scale_px));
+            verdict.doubt(sigma, differing_words(differing, choice));
         }
         let focal = best.minimum.reconstruction.intrinsics[group].focal;
         if !has_own_focals {
@@ -244,12 +244,15 @@ fn principal_point(best: &Candidate, group: usize, inflation: f64, choice: &Choi
     (!unknown.is_empty()).then(|| Warning::new(WarningCode::PrincipalPointUnobservable, detail))
 }
 
-fn differing_words(differing: &Differing, scale_px: f64) -> String {
-    format!(
-        "with a focal length a view (focal_per_view) the images fit better, at {:.1} to {:.1} px",
-        differing.range.0 * scale_px,
-        differing.range.1 * scale_px
-    )
+fn differing_words(differing: &Differing, choice: &Choice) -> String {
+    let (least, most) = differing.range;
+    let lenses = &choice.problem.options.lenses;
+    let range = match lenses.is_plausible(least) && lenses.is_plausible(most) {
+        true => format!(", at {:.1} to {:.1} px", least * choice.scale_px, most * choice.scale_px),
+        // Some views do not determine theirs.
+        false => String::new(),
+    };
+    format!("with a focal length a view (focal_per_view) the images fit better{range}")
 }
 
 fn second_minimum(rival: &Minimum, best: &Candidate, scale_px: f64) -> String {

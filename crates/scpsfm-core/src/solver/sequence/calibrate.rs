@@ -24,8 +24,9 @@ const OFF_CENTRE: f64 = 0.01;
 /// under them and asks the windows; one outcome a camera.
 ///
 /// The observations are those that fit behind the seed's lens. Where the adjustment of all observations moves a focal
-/// length by more than its sigma, everything is calibrated a second time, from what fits behind the adjusted lens. The
-/// second calibration is used unless it grades a camera worse, or the views no longer hold together.
+/// length by more than its sigma, and not so far that the calibration is refused, everything is calibrated a second time,
+/// from what fits behind the adjusted lens. The second calibration is used unless it grades a camera worse, or the views
+/// no longer hold together.
 ///
 /// # Errors
 /// [`Error::Stopped`].
@@ -53,7 +54,8 @@ pub fn calibrate(problem: &Problem, model: &mut Model, recorder: &mut Recorder) 
 struct Calibrated {
     /// One a camera, with a sigma that admits what lies between its focal length and that of the model.
     outcomes: Vec<Outcome>,
-    /// Whether the adjustment of all observations moved a focal length by more than the sigma of its calibration.
+    /// Whether the adjustment of all observations moved a focal length by more than the sigma of its calibration, and
+    /// not so far that it is none.
     focal_moved: bool,
 }
 
@@ -113,8 +115,8 @@ fn calibrate_registered(
         let (Some(graded), Some(sigma)) = (outcome.intrinsics(), outcome.sigma_log_focal) else { continue };
         let difference = (model.lenses[camera].intrinsics.focal / graded.focal).ln().abs();
         if difference > sigma {
-            focal_moved |= outcome.grade != Grade::ProjectiveOnly;
             outcome.raise_sigma(difference, &problem.calibration_options.grades);
+            focal_moved |= outcome.grade != Grade::ProjectiveOnly;
         }
     }
     Ok(Calibrated { outcomes, focal_moved })

@@ -47,15 +47,18 @@ pub fn reconcile(
     Ok(())
 }
 
-/// What the spread of windows about their mean says of the whole: it is moved by as much less as it knows more. Wrong
-/// observations move an estimate along its weakest directions, in units of its sigma (Birge's ratio). A mean that is off
-/// that of the whole is another matter, and counts in full.
+/// What the spread of windows about their mean says of the whole, which knows more than they do. Where wrong observations
+/// move them, each by some of its own sigmas, the whole is moved by as many of its own (Birge's ratio); where the model is
+/// wrong, it may be moved by as much as they are. Which of the two it is they do not tell: the geometric mean of both.
+///
+/// On a real sequence of an error of .08 % sigma would be .02 % by the first, .11 % by the second; in a scene with wrong
+/// observations and an error of .14 %, .38 and 3.6 %. A mean that is off that of the whole counts in full.
 ///
 /// * `spread`: what the sigma of the mean has beyond the formal one
 /// * `own`: sigma of the whole
 /// * `formal`: sigma of the mean, were the windows to differ by chance
 fn of_whole(spread: f64, own: f64, formal: f64) -> f64 {
-    spread * (own / formal).min(1.0)
+    spread * (own / formal).min(1.0).sqrt()
 }
 
 /// Views of a camera that say something of it, increasing.
@@ -163,8 +166,8 @@ mod tests {
 
     #[test]
     fn windows_that_know_little_say_little() {
-        for (own, expected) in [(0.003, 0.004), (0.03, 0.04), (0.06, 0.04)] {
-            assert!((of_whole(0.04, own, 0.03) - expected).abs() < 1e-12, "{own}");
+        for (own, expected) in [(0.003, 0.01), (0.012, 0.02), (0.048, 0.04), (0.1, 0.04)] {
+            assert!((of_whole(0.04, own, 0.048) - expected).abs() < 1e-12, "{own}");
         }
     }
 
