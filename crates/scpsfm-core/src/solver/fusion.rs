@@ -39,8 +39,8 @@ pub struct Fused {
 
 /// Fuses estimates that have this share of their observations in common; `None` for fewer than two.
 ///
-/// The covariance of two estimates is `shared * min(sigma_1^2, sigma_2^2)`: the observations in common carry at most the
-/// information of the weaker one.
+/// The covariance of two estimates is `shared * min(sigma_1^2, sigma_2^2)`: the observations in common carry at most
+/// the information of the weaker one.
 pub fn fuse(estimates: &[Estimate], shared: f64) -> Option<Fused> {
     if estimates.len() < 2 {
         return None;

@@ -79,8 +79,8 @@ pub struct Undone {
 }
 
 impl Undone {
-    /// These lenses of cameras undone in place of what is undone already; a lens that does not image all observations of
-    /// its camera is not. `None` where nothing is undone.
+    /// These lenses of cameras undone in place of what is undone already; a lens that does not image all observations
+    /// of its camera is not. `None` where nothing is undone.
     pub fn new(
         problem: &Problem,
         already: Option<&Self>,

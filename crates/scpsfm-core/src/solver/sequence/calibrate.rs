@@ -24,9 +24,9 @@ const OFF_CENTRE: f64 = 0.01;
 /// under them and asks the windows; one outcome a camera.
 ///
 /// The observations are those that fit behind the seed's lens. Where the adjustment of all observations moves a focal
-/// length by more than its sigma, and not so far that the calibration is refused, everything is calibrated a second time,
-/// from what fits behind the adjusted lens. The second calibration is used unless it grades a camera worse, or the views
-/// no longer hold together.
+/// length by more than its sigma, and not so far that the calibration is refused, everything is calibrated a second
+/// time, from what fits behind the adjusted lens. The second calibration is used unless it grades a camera worse, or the
+/// views no longer hold together.
 ///
 /// # Errors
 /// [`Error::Stopped`].
@@ -69,8 +69,8 @@ impl Calibrated {
 /// Calibrates the cameras of all registered views, takes the models over and adjusts everything under them.
 ///
 /// All cameras are calibrated together where they have few views, or the stretch of their views that is compared with
-/// projective cameras holds enough of each. Where that calibrates none (the stretch may be critical), each is calibrated
-/// by itself.
+/// projective cameras holds enough of each. Where that calibrates none (the stretch may be critical), each is
+/// calibrated by itself.
 ///
 /// * `pass`: how many times they were calibrated before
 fn calibrate_registered(
@@ -140,7 +140,7 @@ pub fn too_few(views: usize) -> Outcome {
     Outcome::refused(vec![Warning::new(WarningCode::UnobservableFocal, detail)])
 }
 
-/// The calibrations of the cameras of these views, whose views have one focal length each, with what they are made from.
+/// The calibrations of the cameras of these views, which have one focal length each, with what they are made from.
 ///
 /// * `stretch`: as of [`of_extract`]
 fn of_run(

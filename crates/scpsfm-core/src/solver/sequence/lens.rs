@@ -48,8 +48,8 @@ const OPTIONS: LensSearchOptions = LensSearchOptions::DEFAULT;
 /// Unknowns of the homography between two views.
 const HOMOGRAPHY_UNKNOWNS: usize = 8;
 
-/// Whether an answer behind lenses explains nearly as much as the one without: a calibration of a part is not to replace
-/// a reconstruction of the whole.
+/// Whether an answer behind lenses explains nearly as much as the one without: a calibration of a part is not to
+/// replace a reconstruction of the whole.
 pub fn explains_enough(evidence: f64, of_pinholes: f64) -> bool {
     evidence > OPTIONS.least_kept * of_pinholes
 }
