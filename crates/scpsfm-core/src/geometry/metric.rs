@@ -219,8 +219,8 @@ mod tests {
         }
     }
 
-    /// Far out, behind the cameras or not a number, behind a lens or not. What is at its minimum stays, and so does what
-    /// may not move.
+    /// Far out, behind the cameras or not a number, behind a lens or not. What is at its minimum stays, and so does
+    /// what may not move.
     #[test]
     fn diverged_points_are_triangulated_anew() {
         for (seed, radial_k1) in [(0, 0.0), (1, -0.2)] {

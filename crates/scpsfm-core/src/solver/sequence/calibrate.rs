@@ -25,8 +25,8 @@ const OFF_CENTRE: f64 = 0.01;
 ///
 /// The observations are those that fit behind the seed's lens. Where the adjustment of all observations moves a focal
 /// length by more than its sigma, and not so far that the calibration is refused, everything is calibrated a second
-/// time, from what fits behind the adjusted lens. The second calibration is used unless it grades a camera worse, or the
-/// views no longer hold together.
+/// time, from what fits behind the adjusted lens. The second calibration is used unless it grades a camera worse, or
+/// the views no longer hold together.
 ///
 /// # Errors
 /// [`Error::Stopped`].
