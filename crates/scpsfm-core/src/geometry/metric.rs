@@ -1,4 +1,4 @@
-//! From a projective to a metric reconstruction, given the DAQ; what a metric one is asked and mended by.
+//! From a projective to a metric reconstruction, given the DAQ; its cheirality, and its points triangulated anew.
 
 use nalgebra::{Matrix3, Matrix4, Vector3, Vector4};
 
@@ -159,11 +159,9 @@ pub fn retriangulate(
         return 0;
     }
     let mut of_point = vec![Vec::new(); reconstruction.points.len()];
-    for seen in observations.iter().filter(|seen| may_move.get(seen.point) == Some(&true)) {
-        if seen.is_usable(reconstruction.poses.len(), of_point.len()) {
-            of_point[seen.point].push(*seen);
-        }
-    }
+    let (views, points) = (reconstruction.poses.len(), reconstruction.points.len());
+    let counts = |seen: &&Observation| seen.is_usable(views, points) && may_move.get(seen.point) == Some(&true);
+    observations.iter().filter(counts).for_each(|seen| of_point[seen.point].push(*seen));
     let cameras = reconstruction.cameras();
     let mut moved = 0;
     for (point, seen) in of_point.iter().enumerate() {

@@ -66,10 +66,9 @@ pub fn undo_calibrated(problem: &mut Problem, extended: &Extended) -> bool {
     if lenses.is_empty() {
         return false;
     }
-    let found = Undone::new(problem, problem.undone.as_ref(), lenses);
-    let is_any = found.is_some();
-    problem.undone = found.or(problem.undone.take());
-    is_any
+    let Some(found) = Undone::new(problem, problem.undone.as_ref(), lenses) else { return false };
+    problem.undone = Some(found);
+    true
 }
 
 /// Undoes the lenses that explain quick seeds of each camera better than pinholes do, where pinholes give no
