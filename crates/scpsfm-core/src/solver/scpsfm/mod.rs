@@ -7,7 +7,9 @@
 //!
 //! A head of kept tracks S has `J = -|S| + Σ_{k>=5} σ_k²(M_S) / tau² + 3 e` (eq. 10, its rank constraint as eq. 8's
 //! distance at the noise, its self-calibration constraint as the DAQ residual `e = 1/2 min Σ_i | S_i/|S_i| - ω/|ω| |²`
-//! over K and the plane at infinity; the paper sums the norms). Without the DAQ term: no e. The lowest J is chosen.
+//! over K and the plane at infinity; the paper sums the norms). Without the DAQ term: no e. The lowest J is chosen. tau,
+//! the residual at which a track leaves the consensus, is one for all heads: the median over those that keep more than
+//! four tracks. Four tell no noise, and at strong noise most heads end with no more.
 //!
 //! Heads end with one that is accepted: at least four tracks that stand apart from wrong ones and whose e is small, or
 //! without the DAQ term at least eight that stand apart. A chosen head is verified where it is accepted with at least
@@ -41,7 +43,8 @@ const NETWORK_LEAST_VIEWS: usize = 2;
 const TOO_FEW: f64 = 100.0;
 /// DAQ residual of such a head; there are no cameras to take it of.
 const WORST_DAQ: f64 = 10.0;
-/// Tolerance of a single head by the literal objective, which is compared with no other.
+/// Tolerance where it decides nothing: by the literal objective, whose one head is compared with no other, and where no
+/// head keeps more than four tracks, whose energy is 0.
 const ANY_TOLERANCE: f64 = 1.0;
 /// Between the seeds of two heads' networks: callers' seeds are small numbers, which must not meet.
 const SEED_STRIDE: u64 = 1 << 32;
@@ -286,8 +289,9 @@ impl HeadSearch {
 
     /// The head of least J; of equals the first.
     fn best(&self) -> Option<&FinishedHead> {
-        let mut tolerances: Vec<f64> = self.heads.iter().map(|head| head.tolerance).collect();
-        let tolerance = midpoint_median(&mut tolerances);
+        let measured = self.heads.iter().filter(|head| head.kept > RANK);
+        let mut tolerances: Vec<f64> = measured.map(|head| head.tolerance).collect();
+        let tolerance = if tolerances.is_empty() { ANY_TOLERANCE } else { midpoint_median(&mut tolerances) };
         let objective = |head: &FinishedHead| {
             let daq = if self.settings.use_daq { self.options.daq_weight * head.daq_residual } else { 0.0 };
             let too_few = if head.kept < RANK { TOO_FEW } else { 0.0 };

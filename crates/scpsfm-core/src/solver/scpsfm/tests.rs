@@ -8,7 +8,11 @@ use crate::synthetic::{Scene, SceneOptions};
 
 /// The measurement matrix of a scene of 10 views and 200 tracks, and which tracks are right.
 fn scene(outliers: f64, seed: u64) -> (DMatrix<f64>, Vec<bool>) {
-    let options = SceneOptions { outliers, seed, with_depths: true, ..SceneOptions::default() };
+    scene_of(&SceneOptions { outliers, seed, ..SceneOptions::default() })
+}
+
+fn scene_of(options: &SceneOptions) -> (DMatrix<f64>, Vec<bool>) {
+    let options = SceneOptions { with_depths: true, ..options.clone() };
     let scene = Scene::generate(&options).expect("valid options");
     let input = crate::domain::Input::new(scene.input.clone(), &Limits::default(), "scene").expect("a valid scene");
     (of_all_views(&input).complete.measurement_matrix(), scene.truth.inlier)
@@ -37,6 +41,21 @@ fn the_first_head_is_accepted_where_it_stands_apart() {
         assert!(agreement(&kept, &inlier).f1 > 0.99, "{outliers}");
         assert_eq!((ended.is_verified(), ended.heads.len()), (true, 1), "{outliers}");
     }
+}
+
+/// At strong noise most heads end with no more than four tracks; the choice goes by the others.
+#[test]
+fn heads_that_kept_hardly_anything_have_no_say_in_the_choice() {
+    let mut were_most = false;
+    for seed in 0..3 {
+        let (matrix, inlier) = scene_of(&SceneOptions { outliers: 0.9, noise: 0.09, seed, ..SceneOptions::default() });
+        let ended = run(search(&matrix, 500, 6));
+        let kept: Vec<bool> = ended.weights().iter().map(|&w| w > THRESHOLD).collect();
+        let f1 = agreement(&kept, &inlier).f1;
+        assert!(f1 > 0.85, "seed {seed}: {f1}");
+        were_most |= 2 * ended.heads.iter().filter(|head| head.kept <= RANK).count() >= ended.heads.len();
+    }
+    assert!(were_most, "none of the scenes is a case of it");
 }
 
 #[test]
@@ -146,4 +165,7 @@ fn the_choice_weighs_size_rank_and_calibration() {
     assert_eq!(chosen(false, vec![head(5, 0.001, 2.0), head(5, 0.001, 0.1)]), (0, false, false), "the first of equals");
     assert_eq!(chosen(false, vec![head(7, 0.0, 0.0)]), (0, false, false));
     assert_eq!(chosen(false, vec![head(8, 0.0, 0.0)]), (0, true, true));
+    // Four tracks tell no noise.
+    let four = || FinishedHead { tolerance: 0.02, ..head(4, 0.0, 1.4) };
+    assert_eq!(chosen(true, vec![four(), four(), head(20, 0.05, 0.4)]), (2, true, false));
 }
