@@ -73,7 +73,7 @@ pub async fn run(args: Args) -> Result<Exit, Failure> {
 
 /// The name of the state that is counted; a server of a later version may count others.
 fn state_name(of: &proto::JobCount) -> &'static str {
-    JobState::required(of.state, "state").map_or("UNKNOWN", JobState::name)
+    JobState::known(of.state).map_or("UNKNOWN", JobState::name)
 }
 
 fn queue_json(queue: &proto::Queue) -> Value {

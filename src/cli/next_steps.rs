@@ -99,6 +99,7 @@ pub fn advice(outcome: Outcome) -> Option<String> {
     let has = |code| outcome.warnings.iter().any(|warning| warning.code == code);
     Some(match REMEDIES.iter().find(|(code, _)| has(*code)) {
         Some((code, remedy)) => format!("{found} by {}: {remedy}", code.name()),
+        None if has(WarningCode::Unknown) => format!("{found}: the warnings of a later version may say why"),
         None if outcome.has_own_focals => format!("{found} is the best grade where each view has its own focal length"),
         None => format!("{found}: {MORE_VIEWS}"),
     })

@@ -241,6 +241,16 @@ pub(super) struct EventFollower<'a> {
 }
 
 impl EventFollower<'_> {
+    /// The event where it is a new one of a kind that this version knows.
+    fn take(&mut self, event: proto::JobEvent, backoff: &mut Backoff) -> Result<Option<JobEvent>, Error> {
+        if (1..=self.last_sequence).contains(&event.sequence) {
+            return Ok(None);
+        }
+        backoff.reset();
+        self.last_sequence = self.last_sequence.max(event.sequence);
+        Ok(convert::job::event_from_wire(event)?)
+    }
+
     /// Follows one stream, which the server has just taken, to its end. The inner error is worth another try; `None`:
     /// it ended without a terminal state.
     pub(super) async fn follow(
@@ -252,22 +262,16 @@ impl EventFollower<'_> {
         // The end of the job, unless more comes: it may have been retried since.
         let mut end = None;
         loop {
-            let event = match (events.message().await, end) {
-                (Ok(Some(event)), _) => convert::job::event_from_wire(event)?,
-                (Ok(None) | Err(_), Some(end)) => return Ok(Ok(Some(end))),
-                (Ok(None), None) => return Ok(Ok(None)),
-                (Err(status), None) => return Ok(Err(status)),
+            let event = match events.message().await {
+                Ok(Some(event)) => event,
+                Ok(None) => return Ok(Ok(end)),
+                Err(status) => return Ok(end.map(Some).ok_or(status)),
             };
-            end = None;
-            if event.sequence.is_some_and(|sequence| sequence <= self.last_sequence) {
-                continue;
-            }
-            backoff.reset();
-            self.last_sequence = event.sequence.unwrap_or(self.last_sequence);
+            // An unknown event takes no end back: a retried job tells first that it is queued.
+            let Some(event) = self.take(event, backoff)? else { continue };
             (self.on_event)(&event);
-            if matches!(event.body, EventBody::State { state, .. } if state.is_terminal()) {
-                end = Some(event);
-            }
+            let is_end = matches!(event.body, EventBody::State { state, .. } if state.is_terminal());
+            end = is_end.then_some(event);
         }
     }
 }
@@ -325,5 +329,35 @@ pub(super) fn create_request(
             ..proto::Job::default()
         }),
         source: Some(input),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn events_are_taken_once_and_unknown_ones_are_passed_over() {
+        let mut backoff = Backoff::default();
+        let mut follower = EventFollower { last_sequence: 4, on_event: &mut |_| () };
+        let mut take = |sequence, body| {
+            let event = proto::JobEvent {
+                job: "tenants/default/jobs/a".into(),
+                sequence,
+                time: Some(Default::default()),
+                body,
+                ..Default::default()
+            };
+            let taken = follower.take(event, &mut backoff).expect("well formed");
+            (taken.and_then(|event| event.sequence), follower.last_sequence)
+        };
+        let queued = Some(proto::job_event::Body::StateChange(proto::StateChange { state: 1, error: None }));
+        assert_eq!(take(4, queued.clone()), (None, 4));
+        assert_eq!(take(5, queued.clone()), (Some(5), 5));
+        assert_eq!(take(6, None), (None, 6));
+        assert_eq!(take(6, queued.clone()), (None, 6));
+        assert_eq!(take(7, queued), (Some(7), 7));
+        let weights = proto::InterimWeights { iteration: 1, weights: vec![0.5] };
+        assert_eq!(take(0, Some(proto::job_event::Body::Weights(weights))), (None, 7), "unsequenced");
     }
 }

@@ -373,7 +373,7 @@ pub(super) fn invalid(field: &str, description: impl Into<String>) -> Box<Answer
 /// Whether a job has ended and had its last event by then. A browser's `EventSource` asks again whenever its stream
 /// ends, until it is told that there is nothing more.
 fn is_complete(job: &proto::Job, after_sequence: u64) -> bool {
-    JobState::required(job.state, "state").is_ok_and(JobState::is_terminal) && job.last_sequence <= after_sequence
+    JobState::known(job.state).is_some_and(JobState::is_terminal) && job.last_sequence <= after_sequence
 }
 
 /// Does what takes long for so many bytes on a thread that serves nobody else.

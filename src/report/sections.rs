@@ -160,7 +160,7 @@ pub fn convergence(solution: &Solution) -> String {
         clip,
         marks: stage_starts(history),
     };
-    let clip = solution.calibrations.first().map(|camera| (camera.focal_px / FOCAL_CLIP, camera.focal_px * FOCAL_CLIP));
+    let clip = solution.first_calibration().map(|camera| (camera.focal_px / FOCAL_CLIP, camera.focal_px * FOCAL_CLIP));
     let charts = [
         losses,
         single("Inliers of the best hypothesis", over_steps(|record| Some(f64::from(record.inliers))), None),

@@ -48,6 +48,7 @@ pub fn warning(code: WarningCode) -> &'static str {
         WarningCode::DuplicateTracks => {
             "Some tracks stand in the input several times; they count once, and all have the same answer."
         }
+        WarningCode::Unknown => "The server is of a later version and gives a warning that this program does not know.",
     }
 }
 

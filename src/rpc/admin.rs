@@ -3,6 +3,7 @@
 use tonic::{Request, Response, Status};
 
 use super::caller::Caller;
+use super::convert::count_to_wire;
 use super::convert::enums::Twin;
 use super::{proto, status};
 use crate::engine::{Engine, QueueReport, TenantQueue};
@@ -65,8 +66,8 @@ fn to_wire(report: QueueReport) -> proto::Queue {
     let (oldest_job, oldest_queue_time) = report.oldest.unzip();
     let tenant = |of: TenantQueue| proto::TenantQueue {
         tenant: format!("tenants/{}", of.tenant),
-        queued_job_count: of.queued,
-        running_job_count: of.running,
+        queued_job_count: count_to_wire(of.queued),
+        running_job_count: count_to_wire(of.running),
     };
     proto::Queue {
         paused: report.pause_time.is_some(),
@@ -74,7 +75,7 @@ fn to_wire(report: QueueReport) -> proto::Queue {
         job_counts: report
             .jobs
             .iter()
-            .map(|&(state, count)| proto::JobCount { state: state.to_wire(), count })
+            .map(|&(state, jobs)| proto::JobCount { state: state.to_wire(), count: count_to_wire(jobs) })
             .collect(),
         oldest_job: oldest_job.map(|name| name.to_string()).unwrap_or_default(),
         oldest_queue_time: oldest_queue_time.map(Into::into),

@@ -444,6 +444,9 @@ class EventFollower:
             trouble.backoff.reset()
             self.sequence = event.sequence or self.sequence
             self.name = event.job
+            if event.WhichOneof("body") is None:
+                # Of a kind that this version does not know; a job that was retried tells first that it is queued.
+                continue
             yield Emit(event)
             last = event if _is_end(event) else None
 
@@ -476,7 +479,10 @@ def _wait(trouble: Trouble, name: str) -> Flow[job_pb2.Job]:
     request = job_service_pb2.GetJobRequest(name=name)
     while True:
         job: job_pb2.Job = yield from _call(trouble, "GetJob", request)
-        if state_of(job.state).is_final:
+        state = state_of(job.state)
+        if state is JobState.UNSPECIFIED:
+            raise InternalError(f"the state {job.state} of {name} is of a later version", reason="UNKNOWN_STATE")
+        if state.is_final:
             return job
         yield from _watch(trouble, name, job.last_sequence)
 

@@ -225,8 +225,9 @@ class Camera:
 
     camera_group: int
 
-    part: int
-    """Which reconstruction it belongs to, the largest being 0; parts have frames and scales of their own."""
+    part: int | None
+    """Which reconstruction it belongs to, the largest being 0; parts have frames and scales of their own. `None`: the
+    view is not registered."""
 
     P: Floats | None
     """Projective camera in pixels, in the frame P1 = [I|0] of the first registered view of the part. (3, 4).
@@ -414,13 +415,13 @@ class Result:
 
     @property
     def focal_px(self) -> float | None:
-        """Focal length of the first camera group in pixels; `None` without a calibration."""
-        return self.calibrations[0].focal_px if self.calibrations else None
+        """Focal length of the first camera group with registered views, in pixels; `None` without a calibration."""
+        return self._first_calibration.focal_px if self._first_calibration else None
 
     @property
     def sigma_log_focal(self) -> float | None:
         """One standard deviation of its natural logarithm; `None`: unobservable, or no calibration."""
-        return self.calibrations[0].sigma_log_focal if self.calibrations else None
+        return self._first_calibration.sigma_log_focal if self._first_calibration else None
 
     @property
     def method(self) -> str:
@@ -510,6 +511,14 @@ class Result:
         )
 
     @cached_property
+    def _first_calibration(self) -> Calibration | None:
+        registered = {camera.camera_group for camera in self.cameras if camera.is_registered}
+        if not registered:
+            return None
+        seen = (found for found in self.calibrations if found.camera_group is None or found.camera_group in registered)
+        return next(seen, None)
+
+    @cached_property
     def _groups(self) -> list[int]:
         return sorted({view.camera_group for view in self.message.views})
 
@@ -534,7 +543,7 @@ class Result:
                     view=index,
                     name=view.name or (self.input.views[index].name if self.input is not None else ""),
                     camera_group=view.camera_group,
-                    part=view.part,
+                    part=view.part if view.projection else None,
                     P=_row(view.projection, np.float64, 12, "numbers in a camera").reshape(3, 4)
                     if view.projection
                     else None,
@@ -648,7 +657,9 @@ class Result:
 
 
 def _calibration(message: result_pb2.Calibration, group: int | None) -> Calibration:
-    fisheye = result_pb2.LensProjection.Value("LENS_PROJECTION_FISHEYE")
+    lens = word(result_pb2.LensProjection, message.lens_projection, "LENS_PROJECTION_")
+    if lens.startswith("UNKNOWN"):
+        raise InternalError(f"the lens is of a kind that this version does not know: {lens}", reason="INVALID_RESULT")
     return Calibration(
         camera_group=group,
         focal_px=message.focal_px,
@@ -657,7 +668,7 @@ def _calibration(message: result_pb2.Calibration, group: int | None) -> Calibrat
         aspect=message.aspect,
         radial=(message.radial_k1, message.radial_k2, message.radial_k3),
         tangential=(message.tangential_p1, message.tangential_p2),
-        is_fisheye=message.lens_projection == fisheye,
+        is_fisheye=lens == "FISHEYE",
         grade=_grade(message.grade),
         sigma_principal_point_px=(
             optional(message, "sigma_principal_point_x_px"),

@@ -48,6 +48,33 @@ def running() -> job_pb2.Job:
     return job_pb2.Job(name=NAME, state=job_pb2.JOB_STATE_RUNNING, last_sequence=4)
 
 
+def entered(state: Any, sequence: int) -> job_pb2.JobEvent:
+    return job_pb2.JobEvent(job=NAME, sequence=sequence, state_change=job_pb2.StateChange(state=state))
+
+
+def test_an_event_of_a_later_kind_is_left_out_and_takes_no_end_back() -> None:
+    for later in ([6], [6, 7], []):
+        follower = flows.EventFollower(4)
+        stream = Stream(None, accepted=True)
+        stage = Stage(follower.follow(stream, flows.Trouble(context(Clock()), None)))
+        assert stage.op == Read(stream)
+        end = entered(job_pb2.JOB_STATE_SUCCEEDED, 5)
+        assert stage.answer(end) == Emit(end)
+        assert stage.answer() == Read(stream)
+        for sequence in later:
+            assert stage.answer(job_pb2.JobEvent(job=NAME, sequence=sequence)) == Read(stream)
+        with pytest.raises(StopIteration) as stopped:
+            stage.answer()
+        assert stopped.value.value == end
+        assert follower.sequence == max([5, *later])
+
+
+def test_a_state_of_a_later_version_is_no_reason_to_ask_for_ever() -> None:
+    stage = Stage(flows.wait(context(Clock()), NAME, None))
+    with pytest.raises(scpsfm.InternalError, match="state 77"):
+        stage.answer(job_pb2.Job(name=NAME, state=77))  # type: ignore[arg-type]
+
+
 def test_a_call_that_succeeded_ended_its_trouble() -> None:
     clock = Clock()
     stage = Stage(flows.wait(context(clock), NAME, None))
@@ -64,7 +91,7 @@ def test_a_call_that_succeeded_ended_its_trouble() -> None:
     stream = Stream(None, accepted=True)
     assert isinstance(stage.answer(), Open)
     assert stage.answer(stream) == Read(stream)
-    event = job_pb2.JobEvent(job=NAME, sequence=5)
+    event = entered(job_pb2.JOB_STATE_RUNNING, 5)
     assert stage.answer(event) == Emit(event)
     assert stage.answer() == Read(stream)
     clock.now += 3600.0

@@ -111,7 +111,12 @@ def test_calibrations_are_those_of_the_groups() -> None:
     assert [calibration.camera_group for calibration in result.calibrations] == [4, 9]
     assert [camera.focal_px for camera in result.cameras] == [200.0, 100.0, 250.0]
     assert [camera.K[0, 0] for camera in result.cameras if camera.K is not None] == [200.0, 100.0, 250.0]
-    assert result.sigma_log_focal is None
+    # No view is registered: there is no first camera.
+    assert (result.focal_px, result.sigma_log_focal) == (None, None)
+    message.views[2].projection.extend(range(12))
+    assert Result(message).focal_px == 200.0
+    message.views[1].projection.extend(range(12))
+    assert Result(message).focal_px == 100.0
     # Cameras that were solved as one.
     del message.calibrations[1]
     merged = Result(message)
@@ -139,7 +144,7 @@ def test_nothing_found_is_a_result_too() -> None:
     assert not any(camera.is_registered for camera in result.cameras)
     assert result.cameras[1].left_out == scpsfm.LeftOut("NOT_REGISTERED", 7, 0)
     assert result.cameras[0].left_out is None
-    assert (result.cameras[0].P, result.cameras[0].center) == (None, None)
+    assert (result.cameras[0].P, result.cameras[0].center, result.cameras[0].part) == (None, None, None)
     with pytest.raises(ValueError, match="no metric pose"):
         result.cameras[0].project(np.zeros((1, 3)))
     assert [str(warning) for warning in result.warnings] == ["NO_CONSENSUS: none"]
@@ -161,6 +166,7 @@ def test_lengths_that_do_not_fit_are_told(small: scene.Scene) -> None:
         (lambda message: message.calibrations.extend([message.calibrations[0]] * 2), "3 calibrations of 1"),
         (lambda message: message.observations.residuals_px.pop(), "residuals"),
         (lambda message: message.observations.judged.pop(), "verdicts"),
+        (lambda message: setattr(message.calibrations[0], "lens_projection", 77), "lens is of a kind"),
         (lambda message: message.views[1].rotation.pop(), "numbers in a rotation"),
     ):
         message = scene.true_result(small)

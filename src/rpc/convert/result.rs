@@ -72,7 +72,7 @@ pub fn from_wire(result: proto::JobResult) -> Result<Solution, Violation> {
         status: Status::required(result.status, "status")?,
         grade: Grade::from_wire(result.grade, "grade")?,
         method: Method::required(result.method, "method")?,
-        winning_proposal: Proposal::from_wire(result.winning_proposal, "winning_proposal")?,
+        winning_proposal: Proposal::known(result.winning_proposal),
         iterations: result.iteration_count,
         seed: result.seed,
         calibrations: result.calibrations.iter().map(calibration_from_wire).collect::<Result<_, _>>()?,
@@ -84,21 +84,21 @@ pub fn from_wire(result: proto::JobResult) -> Result<Solution, Violation> {
         noise_px: result.noise_px,
         reprojection_rms_px: result.reprojection_rms_px,
         reprojection_mean_px: result.reprojection_mean_px,
-        warnings: warnings_from_wire(&result.warnings, "warnings.code")?,
+        warnings: warnings_from_wire(&result.warnings),
         seconds: seconds_from_wire(result.solve_duration, "solve_duration")?,
         stages: result
             .stage_times
             .iter()
-            .map(|time| {
-                let stage = Stage::required(time.stage, "stage_times.stage")?;
+            .filter_map(|time| Some((Stage::known(time.stage)?, time)))
+            .map(|(stage, time)| {
                 Ok(StageTime { stage, seconds: seconds_from_wire(time.duration, "stage_times.duration")? })
             })
             .collect::<Result<_, Violation>>()?,
         proposal_times: result
             .proposal_times
             .iter()
-            .map(|time| {
-                let proposal = Proposal::required(time.proposal, "proposal_times.proposal")?;
+            .filter_map(|time| Some((Proposal::known(time.proposal)?, time)))
+            .map(|(proposal, time)| {
                 let seconds = match time.duration {
                     Some(duration) => Some(seconds_from_wire(Some(duration), "proposal_times.duration")?),
                     None => None,
@@ -106,7 +106,11 @@ pub fn from_wire(result: proto::JobResult) -> Result<Solution, Violation> {
                 Ok(ProposalTime { proposal, seconds, iterations: time.iteration_count })
             })
             .collect::<Result<_, Violation>>()?,
-        history: result.progress_records.iter().map(progress::from_wire).collect::<Result<_, _>>()?,
+        history: result
+            .progress_records
+            .iter()
+            .filter_map(|record| progress::from_wire(record).transpose())
+            .collect::<Result<_, _>>()?,
         trained_network_sha256: digest_from_wire(&result.trained_network_sha256, "trained_network_sha256")?,
         input_sha256: digest_from_wire(&result.input_sha256, "input_sha256")?,
         joined_tracks: result.joined_tracks.map(joined_tracks_from_wire).transpose()?,
@@ -135,12 +139,11 @@ pub(super) fn warnings_to_wire(warnings: &[Warning]) -> Vec<proto::Warning> {
     warnings.iter().map(warning).collect()
 }
 
-/// # Errors
-/// A violation of `field` for a code that this version does not know.
-pub(super) fn warnings_from_wire(warnings: &[proto::Warning], field: &str) -> Result<Vec<Warning>, Violation> {
-    let warning = |warning: &proto::Warning| {
-        let code = WarningCode::required(warning.code, field)?;
-        Ok(Warning { code, detail: warning.detail.clone(), camera_group: warning.camera_group })
+pub(super) fn warnings_from_wire(warnings: &[proto::Warning]) -> Vec<Warning> {
+    let warning = |warning: &proto::Warning| Warning {
+        code: WarningCode::known(warning.code).unwrap_or(WarningCode::Unknown),
+        detail: warning.detail.clone(),
+        camera_group: warning.camera_group,
     };
     warnings.iter().map(warning).collect()
 }
@@ -205,7 +208,7 @@ fn view_to_wire(view: &ViewResult) -> proto::ViewResult {
         rotation: view.rotation.iter().flatten().flatten().copied().collect(),
         translation: view.translation.iter().flatten().copied().collect(),
         focal_px: view.focal_px,
-        part: view.part,
+        part: view.projection.is_some().then_some(view.part),
         camera_group: view.camera_group,
         left_out: view.left_out.map(left_out_to_wire),
         name: view.name.as_deref().unwrap_or_default().to_owned(),
@@ -218,24 +221,21 @@ fn left_out_to_wire(left_out: LeftOut) -> proto::LeftOut {
         LeftOut::NoObservations => (Reason::NoObservations, 0, 0),
         LeftOut::OutsideBlock => (Reason::OutsideBlock, 0, 0),
         LeftOut::NotRegistered { points, agreeing } => (Reason::NotRegistered, points, agreeing),
+        LeftOut::Unknown => (Reason::Unspecified, 0, 0),
     };
     proto::LeftOut { reason: reason.into(), point_count, agreeing_point_count }
 }
 
-fn left_out_from_wire(left_out: &proto::LeftOut, view: usize) -> Result<Option<LeftOut>, Violation> {
+fn left_out_from_wire(left_out: &proto::LeftOut) -> LeftOut {
     use proto::LeftOutReason as Reason;
-    let unknown = |_| {
-        let what = format!("{} is not a known LeftOutReason", left_out.reason);
-        Violation::at("views.left_out.reason", view, what)
-    };
-    Ok(match Reason::try_from(left_out.reason).map_err(unknown)? {
-        Reason::Unspecified => None,
-        Reason::NoObservations => Some(LeftOut::NoObservations),
-        Reason::OutsideBlock => Some(LeftOut::OutsideBlock),
+    match left_out.reason() {
+        Reason::Unspecified => LeftOut::Unknown,
+        Reason::NoObservations => LeftOut::NoObservations,
+        Reason::OutsideBlock => LeftOut::OutsideBlock,
         Reason::NotRegistered => {
-            Some(LeftOut::NotRegistered { points: left_out.point_count, agreeing: left_out.agreeing_point_count })
+            LeftOut::NotRegistered { points: left_out.point_count, agreeing: left_out.agreeing_point_count }
         }
-    })
+    }
 }
 
 fn view_from_wire((index, view): (usize, &proto::ViewResult)) -> Result<ViewResult, Violation> {
@@ -252,12 +252,9 @@ fn view_from_wire((index, view): (usize, &proto::ViewResult)) -> Result<ViewResu
             other => return Err(wrong("translation", 3, other)),
         },
         focal_px: view.focal_px,
-        part: view.part,
+        part: view.part.unwrap_or(0),
         camera_group: view.camera_group,
-        left_out: match &view.left_out {
-            Some(left_out) => left_out_from_wire(left_out, index)?,
-            None => None,
-        },
+        left_out: view.left_out.as_ref().map(left_out_from_wire),
     })
 }
 

@@ -186,6 +186,39 @@ fn a_malformed_answer_names_its_field() {
     assert_eq!(with(&|result| tracks(result, &|tracks| tracks.points.truncate(2))), "tracks.points");
     assert_eq!(with(&|result| tracks(result, &|tracks| tracks.point_parts.push(1))), "tracks.point_parts");
     assert_eq!(with(&|result| result.calibrations[0].grade = 9), "calibrations.grade");
-    let reason = |result: &mut proto::JobResult| result.views[3].left_out.as_mut().expect("set").reason = 9;
-    assert_eq!(with(&reason), "views.left_out.reason[3]");
+    assert_eq!(with(&|result| result.calibrations[0].lens_projection = 9), "calibrations.lens_projection");
+}
+
+/// A number that a later version added costs the answer the record that it stands in, and no more.
+#[test]
+fn what_only_a_later_version_knows_is_left_out() {
+    let mut result = to_wire(&name(), &rich());
+    let mut expected = rich();
+    result.winning_proposal = 99;
+    expected.winning_proposal = None;
+    result.stage_times[0].stage = 99;
+    expected.stages.remove(0);
+    result.proposal_times[0].proposal = 99;
+    expected.proposal_times.remove(0);
+    result.progress_records[0].stage = 99;
+    expected.history.remove(0);
+    result.views[3].left_out.as_mut().expect("set").reason = 99;
+    expected.views[3].left_out = Some(LeftOut::Unknown);
+    result.warnings[0].code = 99;
+    expected.warnings[0].code = WarningCode::Unknown;
+    assert_eq!(from_wire(result), Ok(expected.clone()));
+    // What is unknown stays so where it is written again.
+    assert_eq!(over_the_wire(&expected), expected);
+}
+
+/// 0 is a part: only what is absent tells that a view has none.
+#[test]
+fn only_registered_views_have_a_part() {
+    let result = to_wire(&name(), &rich());
+    for (view, solved) in result.views.iter().zip(rich().views) {
+        assert_eq!(view.part, solved.projection.map(|_| solved.part));
+    }
+    assert!(
+        result.views.iter().any(|view| view.part == Some(0)) && result.views.iter().any(|view| view.part.is_none())
+    );
 }

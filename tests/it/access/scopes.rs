@@ -104,8 +104,8 @@ async fn an_administrator_reaches_the_jobs_of_every_tenant() {
     let mut tenants: Vec<_> = queue.tenants.iter().map(|of| of.tenant.as_str()).collect();
     tenants.sort_unstable();
     assert_eq!(tenants, ["tenants/north", "tenants/ops"]);
-    let jobs: u64 = queue.tenants.iter().map(|of| of.queued_job_count + of.running_job_count).sum();
+    let jobs: u32 = queue.tenants.iter().map(|of| of.queued_job_count + of.running_job_count).sum();
     assert_eq!(jobs, 3);
-    let counted: u64 = queue.job_counts.iter().map(|of| of.count).sum();
+    let counted: u32 = queue.job_counts.iter().map(|of| of.count).sum();
     assert_eq!((queue.job_counts.len(), counted, queue.paused), (6, 3, false));
 }

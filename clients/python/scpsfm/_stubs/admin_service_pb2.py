@@ -18,7 +18,7 @@ from google.protobuf import timestamp_pb2 as google_dot_protobuf_dot_timestamp__
 from . import job_pb2 as scpsfm_dot_v1_dot_job__pb2
 
 
-DESCRIPTOR = _descriptor_pool.Default().AddSerializedFile(b'\n\x1dscpsfm/v1/admin_service.proto\x12\tscpsfm.v1\x1a\x1cgoogle/api/annotations.proto\x1a\x1fgoogle/protobuf/timestamp.proto\x1a\x13scpsfm/v1/job.proto\"\x11\n\x0fGetQueueRequest\"\x13\n\x11PauseQueueRequest\"\x14\n\x12ResumeQueueRequest\"\x14\n\x12\x44rainServerRequest\"%\n\x13\x44rainServerResponse\x12\x0e\n\x06worker\x18\x01 \x01(\t\"\xe4\x01\n\x05Queue\x12\x0e\n\x06paused\x18\x01 \x01(\x08\x12.\n\npause_time\x18\x02 \x01(\x0b\x32\x1a.google.protobuf.Timestamp\x12\'\n\njob_counts\x18\x03 \x03(\x0b\x32\x13.scpsfm.v1.JobCount\x12\x12\n\noldest_job\x18\x04 \x01(\t\x12\x35\n\x11oldest_queue_time\x18\x05 \x01(\x0b\x32\x1a.google.protobuf.Timestamp\x12\'\n\x07tenants\x18\x06 \x03(\x0b\x32\x16.scpsfm.v1.TenantQueue\"=\n\x08JobCount\x12\"\n\x05state\x18\x01 \x01(\x0e\x32\x13.scpsfm.v1.JobState\x12\r\n\x05\x63ount\x18\x02 \x01(\x04\"R\n\x0bTenantQueue\x12\x0e\n\x06tenant\x18\x01 \x01(\t\x12\x18\n\x10queued_job_count\x18\x02 \x01(\x04\x12\x19\n\x11running_job_count\x18\x03 \x01(\x04\x32\xfd\x02\n\x0c\x41\x64minService\x12K\n\x08GetQueue\x12\x1a.scpsfm.v1.GetQueueRequest\x1a\x10.scpsfm.v1.Queue\"\x11\x82\xd3\xe4\x93\x02\x0b\x12\t/v1/queue\x12X\n\nPauseQueue\x12\x1c.scpsfm.v1.PauseQueueRequest\x1a\x10.scpsfm.v1.Queue\"\x1a\x82\xd3\xe4\x93\x02\x14\"\x0f/v1/queue:pause:\x01*\x12[\n\x0bResumeQueue\x12\x1d.scpsfm.v1.ResumeQueueRequest\x1a\x10.scpsfm.v1.Queue\"\x1b\x82\xd3\xe4\x93\x02\x15\"\x10/v1/queue:resume:\x01*\x12i\n\x0b\x44rainServer\x12\x1d.scpsfm.v1.DrainServerRequest\x1a\x1e.scpsfm.v1.DrainServerResponse\"\x1b\x82\xd3\xe4\x93\x02\x15\"\x10/v1/server:drain:\x01*b\x06proto3')
+DESCRIPTOR = _descriptor_pool.Default().AddSerializedFile(b'\n\x1dscpsfm/v1/admin_service.proto\x12\tscpsfm.v1\x1a\x1cgoogle/api/annotations.proto\x1a\x1fgoogle/protobuf/timestamp.proto\x1a\x13scpsfm/v1/job.proto\"\x11\n\x0fGetQueueRequest\"\x13\n\x11PauseQueueRequest\"\x14\n\x12ResumeQueueRequest\"\x14\n\x12\x44rainServerRequest\"%\n\x13\x44rainServerResponse\x12\x0e\n\x06worker\x18\x01 \x01(\t\"\xe4\x01\n\x05Queue\x12\x0e\n\x06paused\x18\x01 \x01(\x08\x12.\n\npause_time\x18\x02 \x01(\x0b\x32\x1a.google.protobuf.Timestamp\x12\'\n\njob_counts\x18\x03 \x03(\x0b\x32\x13.scpsfm.v1.JobCount\x12\x12\n\noldest_job\x18\x04 \x01(\t\x12\x35\n\x11oldest_queue_time\x18\x05 \x01(\x0b\x32\x1a.google.protobuf.Timestamp\x12\'\n\x07tenants\x18\x06 \x03(\x0b\x32\x16.scpsfm.v1.TenantQueue\"=\n\x08JobCount\x12\"\n\x05state\x18\x01 \x01(\x0e\x32\x13.scpsfm.v1.JobState\x12\r\n\x05\x63ount\x18\x02 \x01(\r\"R\n\x0bTenantQueue\x12\x0e\n\x06tenant\x18\x01 \x01(\t\x12\x18\n\x10queued_job_count\x18\x02 \x01(\r\x12\x19\n\x11running_job_count\x18\x03 \x01(\r2\x80\x03\n\x0c\x41\x64minService\x12N\n\x08GetQueue\x12\x1a.scpsfm.v1.GetQueueRequest\x1a\x10.scpsfm.v1.Queue\"\x14\x90\x02\x01\x82\xd3\xe4\x93\x02\x0b\x12\t/v1/queue\x12X\n\nPauseQueue\x12\x1c.scpsfm.v1.PauseQueueRequest\x1a\x10.scpsfm.v1.Queue\"\x1a\x82\xd3\xe4\x93\x02\x14\"\x0f/v1/queue:pause:\x01*\x12[\n\x0bResumeQueue\x12\x1d.scpsfm.v1.ResumeQueueRequest\x1a\x10.scpsfm.v1.Queue\"\x1b\x82\xd3\xe4\x93\x02\x15\"\x10/v1/queue:resume:\x01*\x12i\n\x0b\x44rainServer\x12\x1d.scpsfm.v1.DrainServerRequest\x1a\x1e.scpsfm.v1.DrainServerResponse\"\x1b\x82\xd3\xe4\x93\x02\x15\"\x10/v1/server:drain:\x01*b\x06proto3')
 
 _globals = globals()
 _builder.BuildMessageAndEnumDescriptors(DESCRIPTOR, _globals)
@@ -26,7 +26,7 @@ _builder.BuildTopDescriptorsAndMessages(DESCRIPTOR, 'scpsfm.v1.admin_service_pb2
 if _descriptor._USE_C_DESCRIPTORS == False:
   DESCRIPTOR._options = None
   _globals['_ADMINSERVICE'].methods_by_name['GetQueue']._options = None
-  _globals['_ADMINSERVICE'].methods_by_name['GetQueue']._serialized_options = b'\202\323\344\223\002\013\022\t/v1/queue'
+  _globals['_ADMINSERVICE'].methods_by_name['GetQueue']._serialized_options = b'\220\002\001\202\323\344\223\002\013\022\t/v1/queue'
   _globals['_ADMINSERVICE'].methods_by_name['PauseQueue']._options = None
   _globals['_ADMINSERVICE'].methods_by_name['PauseQueue']._serialized_options = b'\202\323\344\223\002\024\"\017/v1/queue:pause:\001*'
   _globals['_ADMINSERVICE'].methods_by_name['ResumeQueue']._options = None
@@ -50,5 +50,5 @@ if _descriptor._USE_C_DESCRIPTORS == False:
   _globals['_TENANTQUEUE']._serialized_start=545
   _globals['_TENANTQUEUE']._serialized_end=627
   _globals['_ADMINSERVICE']._serialized_start=630
-  _globals['_ADMINSERVICE']._serialized_end=1011
+  _globals['_ADMINSERVICE']._serialized_end=1014
 # @@protoc_insertion_point(module_scope)

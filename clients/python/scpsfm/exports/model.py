@@ -126,7 +126,7 @@ def models(tracks: Tracks, result: Result) -> list[Model]:
 
     """
     check(tracks, result)
-    posed = [camera for camera in result.cameras if camera.R is not None]
+    posed = [camera for camera in result.cameras if camera.is_registered and camera.R is not None]
     if not result.is_metric or not posed:
         raise FailedPrecondition(
             f"the result is {result.grade} and has {len(posed)} metric poses; cameras are exported of metric ones only",
@@ -134,7 +134,7 @@ def models(tracks: Tracks, result: Result) -> list[Model]:
         )
     return [
         _model(tracks, result, part, [camera for camera in posed if camera.part == part])
-        for part in sorted({camera.part for camera in posed})
+        for part in sorted({camera.part for camera in posed if camera.part is not None})
     ]
 
 

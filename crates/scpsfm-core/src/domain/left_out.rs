@@ -22,6 +22,8 @@ pub enum LeftOut {
     OutsideBlock,
     /// Of the points of a reconstruction that it sees, too few agree on a pose.
     NotRegistered { points: u32, agreeing: u32 },
+    /// A reason that this version does not know: a server of a later one gave it.
+    Unknown,
 }
 
 impl LeftOut {
@@ -31,6 +33,7 @@ impl LeftOut {
             LeftOut::NoObservations => "NO_OBSERVATIONS",
             LeftOut::OutsideBlock => "OUTSIDE_BLOCK",
             LeftOut::NotRegistered { .. } => "NOT_REGISTERED",
+            LeftOut::Unknown => "UNKNOWN",
         }
     }
 }
@@ -45,6 +48,7 @@ impl fmt::Display for LeftOut {
             LeftOut::NotRegistered { points, agreeing } => {
                 write!(f, "{agreeing} of the {points} points it sees agree on a pose")
             }
+            LeftOut::Unknown => f.write_str("for a reason that this version does not know"),
         }
     }
 }
@@ -55,7 +59,7 @@ pub fn warnings(views: &[ViewResult], name: impl Fn(usize) -> String) -> Vec<War
         let reasons = views.iter().enumerate().filter_map(|(view, result)| Some((view, result.left_out?)));
         reasons.filter(|(_, reason)| wanted(*reason)).collect()
     };
-    let unregistered = of(|reason| matches!(reason, LeftOut::NotRegistered { .. }));
+    let unregistered = of(|reason| matches!(reason, LeftOut::NotRegistered { .. } | LeftOut::Unknown));
     let outside = of(|reason| reason == LeftOut::OutsideBlock);
     let empty = of(|reason| reason == LeftOut::NoObservations);
     let observed = views.len() - empty.len();

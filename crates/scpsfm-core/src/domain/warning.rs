@@ -46,6 +46,9 @@ pub enum WarningCode {
     DuplicateTracks,
     /// Tracks stay where they are in the image while others move, and no scene holds them.
     StaticTracks,
+    /// A code that this version does not know: a server of a later one gave it. The detail says what it is.
+    #[serde(other)]
+    Unknown,
 }
 
 impl WarningCode {
@@ -70,7 +73,8 @@ impl WarningCode {
             | WarningCode::CameraGroupsMerged
             | WarningCode::UnverifiedRanking
             | WarningCode::DuplicateTracks
-            | WarningCode::StaticTracks => false,
+            | WarningCode::StaticTracks
+            | WarningCode::Unknown => false,
         }
     }
 
@@ -96,6 +100,7 @@ impl WarningCode {
             WarningCode::UnverifiedRanking => "UNVERIFIED_RANKING",
             WarningCode::DuplicateTracks => "DUPLICATE_TRACKS",
             WarningCode::StaticTracks => "STATIC_TRACKS",
+            WarningCode::Unknown => "UNKNOWN",
         }
     }
 }
@@ -129,5 +134,13 @@ mod tests {
     fn a_name_is_that_of_the_files() {
         let code = WarningCode::CameraGroupsMerged;
         assert_eq!(serde_json::to_value(code).expect("serialisable"), code.name());
+    }
+
+    #[test]
+    fn a_later_versions_code_is_read_as_unknown() {
+        let read = |name: &str| serde_json::from_value::<WarningCode>(name.into()).expect("any name");
+        assert_eq!(read("OF_A_LATER_VERSION"), WarningCode::Unknown);
+        assert_eq!(read(WarningCode::Unknown.name()), WarningCode::Unknown);
+        assert_eq!(read("STATIC_TRACKS"), WarningCode::StaticTracks);
     }
 }
