@@ -112,7 +112,8 @@ fn upload(data: &MessageDescriptor, input: &MessageDescriptor, schemas: &mut Sch
         }],
         "requestBody": {"required": true, "content": {
             "application/json": {"schema": data},
-            "application/x-protobuf": {},
+            // Generators leave a call out that has a body without a schema.
+            "application/x-protobuf": {"schema": {"type": "string", "format": "binary"}},
         }},
         "responses": {
             "200": {"description": "The input.", "content": {"application/json": {"schema": input}}},

@@ -67,6 +67,13 @@ def server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[support.Server]
 
 
 @pytest.fixture
+def http_server(tmp_path: Path) -> Iterator[support.Server]:
+    server = support.Server(tmp_path / "data", "--workers", "1", http_listen="127.0.0.1:0")
+    yield server
+    server.stop()
+
+
+@pytest.fixture
 def real(server: support.Server, kind: str) -> Iterator[Any]:
     with support.client_of(kind, server.address) as client:
         yield client

@@ -37,8 +37,13 @@ def binary() -> Path:
 class Server:
     """A server process, with a data directory that outlives it."""
 
-    def __init__(self, data: Path, *flags: str, environment: dict[str, str] | None = None) -> None:
+    def __init__(
+        self, data: Path, *flags: str, environment: dict[str, str] | None = None, http_listen: str = "off"
+    ) -> None:
         self._data = data
+        self._http_listen = http_listen
+        self.http_url: str | None = None
+        """Of the JSON port, where it is on."""
         self._flags = flags
         self._environment = {**os.environ, **(environment or {})}
         self.address = "127.0.0.1:0"
@@ -49,7 +54,7 @@ class Server:
         command = [str(binary()), "serve", "--listen", self.address.rpartition("//")[2]]
         command += [
             "--http-listen",
-            "off",
+            self._http_listen,
             "--metrics-listen",
             "127.0.0.1:0",
             "--data-dir",
@@ -66,6 +71,9 @@ class Server:
             kind, _, url = line.decode().strip().partition(" ")
             if kind == "grpc":
                 self.address = url
+            if kind == "http":
+                self.http_url = url
+            if self.address != "127.0.0.1:0" and (self._http_listen == "off" or self.http_url):
                 break
         else:
             pytest.fail(f"the server ended with {self.process.wait()}; its log: {Path(log.name).read_text()[-2000:]}")
