@@ -32,7 +32,7 @@ use nalgebra::DMatrix;
 use super::options::ContinuationOptions;
 use crate::domain::Phase;
 use crate::geometry::factorization::{RANK, dominant_subspace, subspace_residuals};
-use crate::geometry::statistics::midpoint_median;
+use crate::geometry::statistics::{chi_square_gate, chi_square_median, midpoint_median};
 use crate::network::losses::{self, RankTerm};
 use crate::network::{Error, NetworkSettings, THRESHOLD};
 
@@ -133,8 +133,10 @@ impl Continuation {
             self.consensus_alpha = self.alpha_of_consensus(balanced, weights)?;
         }
         let gate = match self.start.has_depths {
-            true => unusual_length(balanced.nrows().saturating_sub(RANK), self.options.gate_quantile)
-                .max(self.options.least_gate),
+            true => {
+                let freedom = balanced.nrows().saturating_sub(RANK).max(1) as f64;
+                (chi_square_gate(freedom) / chi_square_median(freedom)).sqrt().max(self.options.least_gate)
+            }
             false => self.options.gate_without_depths,
         };
         if iteration == self.growth_start() {
@@ -213,13 +215,6 @@ impl Continuation {
         let of_wrong = wrong_residual(balanced, weights, &basis);
         tolerance.min(most).min(self.options.wrong_share * of_wrong).max(least)
     }
-}
-
-/// Length of noise in so many dimensions, in units of the median length, that it exceeds as seldom as a standard normal
-/// variable exceeds `quantile` (chi-square's by Wilson and Hilferty, 1931).
-pub fn unusual_length(dimensions: usize, quantile: f64) -> f64 {
-    let variance = 2.0 / (9.0 * dimensions.max(1) as f64);
-    (1.0 + quantile * variance.sqrt() / (1.0 - variance)).powf(1.5)
 }
 
 /// What wrong tracks leave beside the span of a consensus: the median residual of the tracks that are not in it, or of

@@ -23,9 +23,8 @@ pub struct ContinuationOptions {
     /// Alpha at most, at the reference shape.
     pub most_alpha: f64,
     /// Residuals in units of the measured noise at which a track leaves the consensus: with depths, that which noise
-    /// exceeds in as many tracks as a standard normal variable exceeds `gate_quantile`, and at least `least_gate`; with
-    /// depths of 1; and what the first half of the growth multiplies it by.
-    pub gate_quantile: f64,
+    /// exceeds in one of a thousand tracks (2.2 times its median in 3 views, 1.7 in 5, 1.5 in 10), and at least this;
+    /// with depths of 1; and what the first half of the growth multiplies it by.
     pub least_gate: f64,
     pub gate_without_depths: f64,
     pub first_gate_factor: f64,
@@ -58,8 +57,6 @@ impl ContinuationOptions {
         consensus_share: 0.5,
         // Where the tail vanishes, alpha would have no bound.
         most_alpha: 40.0,
-        // One right track in a thousand: 2.2 times the median in 3 views, 1.7 in 5, 1.5 in 10.
-        gate_quantile: 3.09,
         // Columns of unit norm differ in noise. F1 at 5 % noise and 96 % wrong tracks: .926 with 2, .962 with 1.7, .974
         // with 1.5, .974 with 1.35; at 3 % noise .985, .996, .996, .988 (10 views, 16 seeds each).
         least_gate: 1.5,

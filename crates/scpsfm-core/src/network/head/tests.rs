@@ -128,16 +128,6 @@ fn hostile_matrices_are_refused_or_survived() {
     }
 }
 
-/// Against chi-square's quantiles, of .999 over those of .5.
-#[test]
-fn unusual_lengths_are_those_of_chi_square() {
-    for (dimensions, of_thousand, median) in [(5, 20.515, 4.3515), (11, 31.264, 10.341), (26, 54.052, 25.336)] {
-        let expected = f64::sqrt(of_thousand / median);
-        let found = continuation::unusual_length(dimensions, 3.0902);
-        assert!((found / expected - 1.0).abs() < 0.01, "{dimensions}: {found} {expected}");
-    }
-}
-
 /// The caller may give the tracks in the order of the image, so that neighbours are nearly alike.
 #[test]
 fn a_right_consensus_is_separate_in_the_order_of_the_image_too() {

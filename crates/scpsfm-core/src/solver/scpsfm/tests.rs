@@ -32,13 +32,18 @@ fn run(mut search: HeadSearch) -> HeadSearch {
     search
 }
 
+/// F1 of `w > 1/2`.
+fn f1(ended: &HeadSearch, inlier: &[bool]) -> f64 {
+    let kept: Vec<bool> = ended.weights().iter().map(|&w| w > THRESHOLD).collect();
+    agreement(&kept, inlier).f1
+}
+
 #[test]
 fn the_first_head_is_accepted_where_it_stands_apart() {
     for outliers in [0.9, 0.96] {
         let (matrix, inlier) = scene(outliers, 2);
         let ended = run(search(&matrix, 500, 2));
-        let kept: Vec<bool> = ended.weights().iter().map(|&w| w > THRESHOLD).collect();
-        assert!(agreement(&kept, &inlier).f1 > 0.99, "{outliers}");
+        assert!(f1(&ended, &inlier) > 0.99, "{outliers}");
         assert_eq!((ended.is_verified(), ended.heads.len()), (true, 1), "{outliers}");
     }
 }
@@ -50,8 +55,7 @@ fn heads_that_kept_hardly_anything_have_no_say_in_the_choice() {
     for seed in 0..3 {
         let (matrix, inlier) = scene_of(&SceneOptions { outliers: 0.9, noise: 0.09, seed, ..SceneOptions::default() });
         let ended = run(search(&matrix, 500, 6));
-        let kept: Vec<bool> = ended.weights().iter().map(|&w| w > THRESHOLD).collect();
-        let f1 = agreement(&kept, &inlier).f1;
+        let f1 = f1(&ended, &inlier);
         assert!(f1 > 0.85, "seed {seed}: {f1}");
         were_most |= 2 * ended.heads.iter().filter(|head| head.kept <= RANK).count() >= ended.heads.len();
     }
