@@ -61,8 +61,8 @@ pub async fn run(args: Args) -> Result<Exit, Failure> {
         Action::Pause(_) => client.pause_queue().await?,
         Action::Resume(_) => client.resume_queue().await?,
         Action::Drain(_) => {
-            let worker = client.drain_server().await?;
-            let line = if given.json { json!({ "worker": worker }).to_string() } else { format!("{worker} drains") };
+            let server = client.drain_server().await?;
+            let line = if given.json { json!({ "server": server }).to_string() } else { format!("{server} drains") };
             print(&line)?;
             return Ok(Exit::Done);
         }

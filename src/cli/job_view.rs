@@ -119,7 +119,7 @@ fn failure_json(failure: &JobFailure) -> Value {
     let past = |past: &PastAttempt| {
         json!({
             "attempt": past.attempt,
-            "worker": past.worker,
+            "server": past.server,
             "start_time": time(past.start_time),
             "end_time": time(past.end_time),
             "end": past.end,

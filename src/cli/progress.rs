@@ -163,7 +163,7 @@ fn describe(progress: &Progress) -> String {
     if let Some(focal_px) = progress.focal_px {
         text.push_str(&format!(", focal {focal_px:.1} px"));
     }
-    if let Some(score) = progress.best_score {
+    if let Some(score) = progress.best_cost {
         text.push_str(&format!(", score {score:.4}"));
     }
     if let Some(losses) = progress.losses {
@@ -199,7 +199,7 @@ fn whereabouts(progress: &Progress) -> String {
         }
         (Some(Step { task: Task::Cameras, .. }), _) => String::new(),
         (Some(Step { task: Task::Windows, step, steps }), _) => format!("comparing: window {step} of {steps}, "),
-        (Some(Step { task: Task::Judge, step, steps }), _) => format!("judging: {step} of {steps} verdicts, "),
+        (Some(Step { task: Task::Classify, step, steps }), _) => format!("classifying: {step} of {steps} verdicts, "),
         (Some(Step { task: Task::Heads, step, steps }), _) => format!("optimising: head {step} of {steps}, "),
         (None, Stage::Extend) => format!("registering: {registered_views} of {views} views{of_part}, "),
         // Of one block there is nothing to say, unless it is a further part's.
@@ -225,7 +225,7 @@ mod tests {
             head: None,
             inliers: 0,
             focal_px: None,
-            best_score: None,
+            best_cost: None,
             elapsed_seconds,
             reconstruction: ReconstructionProgress::default(),
         }
@@ -260,13 +260,13 @@ mod tests {
             head: None,
             inliers: 19,
             focal_px: None,
-            best_score: None,
+            best_cost: None,
             elapsed_seconds: 1.25,
             reconstruction: ReconstructionProgress::default(),
         };
         assert_eq!(describe(&progress), "19 inliers, 1.2 s");
         progress.focal_px = Some(1204.26);
-        progress.best_score = Some(0.25);
+        progress.best_cost = Some(0.25);
         progress.losses = Some(Losses { num: 1e-4, proj: 0.5, daq: 2.0 });
         assert_eq!(
             describe(&progress),
@@ -300,7 +300,7 @@ mod tests {
         assert_eq!(said(Stage::Extend, step(Task::Adjust)), "adjusting: round 3 of 7, ");
         assert_eq!(said(Stage::Calibrate, step(Task::Cameras)), "calibrating: 3 of 7, ");
         assert_eq!(said(Stage::Calibrate, step(Task::Windows)), "comparing: window 3 of 7, ");
-        assert_eq!(said(Stage::Judge, step(Task::Judge)), "judging: 3 of 7 verdicts, ");
+        assert_eq!(said(Stage::Classify, step(Task::Classify)), "classifying: 3 of 7 verdicts, ");
         assert_eq!(said(Stage::Search, step(Task::Heads)), "optimising: head 3 of 7, ");
         assert_eq!(said(Stage::Calibrate, walk), "");
     }

@@ -116,7 +116,7 @@ fn belongs_together(input: &LabelledInput, solution: &Solution) -> Result<(), Fa
         return Err(Failure { exit: Exit::BadInput, message });
     }
     // Servers of older versions do not tell.
-    if solution.input_sha256.is_none_or(|sha256| sha256 == input.raw.sha256()) {
+    if solution.input_content_sha256.is_none_or(|sha256| sha256 == input.raw.sha256()) {
         return Ok(());
     }
     let differs = other_names(input, solution).unwrap_or_else(|| {

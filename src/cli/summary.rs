@@ -192,7 +192,8 @@ mod tests {
     fn tells_every_camera_and_every_part() {
         let (_, mut solution) = fixture::solved_in_two_parts();
         assert!(text(&solution, None).contains("parts        2, of 3, 2 views, each with a frame"));
-        let second = Calibration { focal_px: 77.0, grade: Some(Grade::Weak), ..solution.calibrations[0] };
+        let second =
+            Calibration { camera_group: 9, focal_px: 77.0, grade: Some(Grade::Weak), ..solution.calibrations[0] };
         solution.calibrations.push(second);
         solution.views[4].camera_group = 9;
         let lines = text(&solution, None);

@@ -44,6 +44,6 @@ impl Client {
         let server = self.call(proto::DrainServerRequest {}, |mut client, request| async move {
             client.admin.drain_server(request).await
         });
-        Ok(server.await?.worker)
+        Ok(server.await?.server)
     }
 }

@@ -179,8 +179,9 @@ impl Failure {
 pub struct PastAttempt {
     /// Counted from 1.
     pub attempt: u32,
-    /// The process that made it.
-    pub worker: String,
+    /// The process that made it. Stores of before 0.2.0 have it under the other name.
+    #[serde(alias = "worker")]
+    pub server: String,
     pub start_time: SystemTime,
     /// When it ended; of a lost one, when that was found.
     pub end_time: SystemTime,

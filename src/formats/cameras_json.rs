@@ -76,13 +76,11 @@ impl From<&Warning> for ReasonJson {
 impl CamerasJson {
     /// The cameras of a solution; without the input, views are numbered from 0.
     pub fn new(solution: &Solution, input: Option<&LabelledInput>) -> Self {
-        let groups = groups_of_views(solution);
         let reason = warnings::reason(solution).map(ReasonJson::from);
         let of_all = reason.as_ref().filter(|_| solution.status == Status::NoReconstruction);
         let camera = |(index, view): (usize, &ViewResult)| {
             let is_metric = view.rotation.is_some() && view.translation.is_some();
-            let calibration =
-                groups.get(index).and_then(|&group| solution.calibrations.get(group)).filter(|_| is_metric);
+            let calibration = solution.calibration_of(view.camera_group).filter(|_| is_metric);
             CameraJson {
                 view: view_label(solution, input, index),
                 registered: view.projection.is_some(),
@@ -111,15 +109,6 @@ impl CamerasJson {
         };
         Self { status: solution.status, views: solution.views.iter().enumerate().map(camera).collect(), reason }
     }
-}
-
-/// Position of each view's camera group among the calibrations; a single calibration is everyone's.
-pub(super) fn groups_of_views(solution: &Solution) -> Vec<usize> {
-    if solution.calibrations.len() < 2 {
-        return vec![0; solution.views.len()];
-    }
-    let ids: Vec<u32> = solution.cameras().into_iter().map(|(group, _)| group).collect();
-    solution.views.iter().map(|view| ids.partition_point(|id| *id < view.camera_group)).collect()
 }
 
 /// The calibration matrix `K`, row by row; `own`: the view's own focal length.

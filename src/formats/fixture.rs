@@ -183,6 +183,7 @@ fn solution(scene: &Scene) -> Solution {
         iterations: 150,
         seed: scene.options.seed,
         calibrations: vec![Calibration {
+            camera_group: 0,
             focal_px: truth.focal_px,
             sigma_log_focal: Some(0.004),
             principal_point_px: truth.principal_point_px,
@@ -227,10 +228,10 @@ fn solution(scene: &Scene) -> Solution {
         warnings: vec![Warning::new(WarningCode::FewInliers, "<b>hostile</b> & \"quoted\" detail")],
         seconds: 1.5,
         stages: Stage::ALL.iter().map(|&stage| StageTime { stage, seconds: 0.3 }).collect(),
-        proposal_times: vec![ProposalTime { proposal: Proposal::Uniform, seconds: None, iterations: 600 }],
+        proposal_times: vec![ProposalTime { proposal: Proposal::Uniform, seconds: None, steps: 600 }],
         history: history(truth.focal_px),
         trained_network_sha256: None,
-        input_sha256: None,
+        input_content_sha256: None,
         joined_tracks: None,
     }
 }
@@ -252,7 +253,7 @@ fn history(focal_px: f64) -> Vec<Progress> {
                 inliers: (20.0 * share) as u32,
                 focal_px: (iteration > 30)
                     .then(|| focal_px * (1.0 + 0.1 * (1.0 - share) * (f64::from(iteration)).sin())),
-                best_score: (iteration > 10).then_some(1.0 - 0.5 * share),
+                best_cost: (iteration > 10).then_some(1.0 - 0.5 * share),
                 elapsed_seconds: share * 1.5,
                 reconstruction: ReconstructionProgress::default(),
             }

@@ -33,6 +33,7 @@ pub(crate) fn fisheye(aspect: f64, radial: [f64; 3], principal_point_px: [f64; 2
 pub(crate) fn lens(aspect: f64, coefficients: [f64; 5], principal_point_px: [f64; 2]) -> Calibration {
     let [radial_k1, radial_k2, radial_k3, tangential_p1, tangential_p2] = coefficients;
     Calibration {
+        camera_group: 0,
         focal_px: 900.0,
         sigma_log_focal: Some(0.01),
         principal_point_px,

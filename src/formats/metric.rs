@@ -5,7 +5,6 @@ use std::collections::{BTreeMap, BTreeSet};
 use nalgebra::{Matrix3, Rotation3, UnitQuaternion, Vector3};
 
 use super::LabelledInput;
-use super::cameras_json::groups_of_views;
 use super::colmap::{FIRST_PIXEL, Frame};
 use super::label::Label;
 use super::ply::colour;
@@ -140,28 +139,26 @@ impl Image {
 }
 
 /// What sets cameras apart: group, size, and the view that has its own focal length.
-type CameraKey = (usize, u32, ImageKey, Option<usize>);
+type CameraKey = (u32, u32, ImageKey, Option<usize>);
 type ImageKey = Option<(u32, u32)>;
 
 /// Cameras and images without keypoints of a part, and the image of each view.
 fn images(solution: &Solution, input: &LabelledInput, part: u32) -> (Vec<Camera>, Vec<Image>, Vec<Option<usize>>) {
-    let groups = groups_of_views(solution);
     let mut cameras = Vec::new();
     let mut known: BTreeMap<CameraKey, usize> = BTreeMap::new();
     let mut images: Vec<Image> = Vec::new();
     let mut image_of_view = vec![None; solution.views.len()];
     let mut own_groups = Vec::new();
     for (view, result) in solution.views.iter().enumerate().filter(|(_, result)| result.part == part) {
-        let calibration = groups.get(view).and_then(|&group| Some((group, solution.calibrations.get(group)?)));
-        let (Some(rotation), Some(translation), Some((group, calibration))) =
-            (result.rotation, result.translation, calibration)
+        let calibration = solution.calibration_of(result.camera_group);
+        let (Some(rotation), Some(translation), Some(calibration)) = (result.rotation, result.translation, calibration)
         else {
             continue;
         };
         let size = input.raw.views.get(view).and_then(|view| view.size);
         let own_group = input.raw.views.get(view).map_or(0, |view| view.camera_group);
         let sides = size.map(|size| (size.width_px, size.height_px));
-        let key = (group, own_group, sides, result.focal_px.map(|_| view));
+        let key = (result.camera_group, own_group, sides, result.focal_px.map(|_| view));
         let camera = *known.entry(key).or_insert_with(|| {
             cameras.push(Camera {
                 colmap_model: input.colmap_images.get(view).and_then(|image| image.camera_model),

@@ -83,7 +83,8 @@ fn two_lens_projections_are_refused() {
     for view in 3..5 {
         (input.raw.views[view].camera_group, solution.views[view].camera_group) = (1, 1);
     }
-    let other = crate::domain::Calibration { lens_projection: LensProjection::Fisheye, ..solution.calibrations[0] };
+    let lens_projection = LensProjection::Fisheye;
+    let other = crate::domain::Calibration { camera_group: 1, lens_projection, ..solution.calibrations[0] };
     solution.calibrations.push(other);
     let model = Model::of_parts(&solution, &input).expect("metric").remove(0);
     assert_eq!(transforms(&model), Err(Error::TwoProjections));

@@ -109,7 +109,7 @@ fn tracks_csv(solution: &Solution, input: Option<&LabelledInput>) -> String {
         let part = tracks.part_of(track).map_or_else(String::new, |part| part.to_string());
         text.push_str(&format!(",{part}"));
         if has_second {
-            text.push_str(&format!(",{}", u8::from(tracks.second_structure.get(track) == Some(&true))));
+            text.push_str(&format!(",{}", tracks.second_structure.get(track).copied().unwrap_or(0)));
         }
         text.push('\n');
     }

@@ -145,9 +145,21 @@ fn a_projective_result_gives_no_calibration_and_says_why() {
 }
 
 #[test]
+fn a_camera_group_without_a_calibration_has_no_others() {
+    let (input, mut solution) = fixture::solved();
+    solution.views[3].camera_group = 9;
+    let cameras = &json(&solution)["cameras"];
+    assert!(cameras[0]["focal_px"].is_number(), "{cameras}");
+    assert_eq!((&cameras[1]["camera_group"], &cameras[1]["focal_px"]), (&9.into(), &Value::Null));
+    let matrices = CamerasJson::new(&solution, Some(&input)).views.into_iter().map(|view| view.K.is_some());
+    assert_eq!(matrices.collect::<Vec<bool>>(), [true, true, true, false, true]);
+}
+
+#[test]
 fn several_camera_groups_are_listed_and_each_view_gets_its_own() {
     let (input, mut solution) = fixture::solved();
     let second = Calibration {
+        camera_group: 9,
         focal_px: 77.0,
         sigma_log_focal: None,
         principal_point_px: [1.0, 2.0],
@@ -310,7 +322,8 @@ fn without_a_network_there_is_no_fourth_column_and_without_the_input_no_observat
 fn tracks_of_a_second_structure_are_marked() {
     let (_, mut solution) = fixture::solved();
     let rejected = solution.tracks.inlier.iter().position(|&inlier| !inlier).expect("an outlier");
-    solution.tracks.second_structure = (0..solution.tracks.inlier.len()).map(|track| track == rejected).collect();
+    solution.tracks.second_structure =
+        (0..solution.tracks.inlier.len()).map(|track| u32::from(track == rejected)).collect();
     let text = tracks_csv(&solution, None);
     let lines: Vec<&str> = text.lines().collect();
     assert_eq!(lines[0], "track,weight,inlier,network_weight,part,second_structure");

@@ -115,7 +115,7 @@ pub struct ProposalTimeJson {
     pub proposal: &'static str,
     /// Null: it never did within the search.
     pub seconds: Option<f64>,
-    pub iterations: u32,
+    pub steps: u32,
 }
 
 /// The camera groups of a result, ascending.
@@ -164,7 +164,7 @@ pub fn camera_groups(solution: &Solution) -> Vec<CameraGroupJson> {
 
 impl From<&ProposalTime> for ProposalTimeJson {
     fn from(time: &ProposalTime) -> Self {
-        Self { proposal: time.proposal.name(), seconds: time.seconds, iterations: time.iterations }
+        Self { proposal: time.proposal.name(), seconds: time.seconds, steps: time.steps }
     }
 }
 

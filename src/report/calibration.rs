@@ -200,8 +200,10 @@ mod tests {
     #[test]
     fn a_row_a_group_with_its_error() {
         let (_, mut solution) = fixture::solved();
+        solution.calibrations[0].camera_group = 4;
         let first = solution.calibrations[0];
         let second = Calibration {
+            camera_group: 9,
             focal_px: 2000.0,
             sigma_log_focal: Some(0.01),
             principal_point_px: [640.0, 480.5],
@@ -243,7 +245,7 @@ mod tests {
     fn other_coefficients_have_a_column_where_a_group_has_them() {
         let (_, mut solution) = fixture::solved();
         let sigmas = Sigmas { tangential_p1: Some(0.0625), ..Sigmas::default() };
-        let second = Calibration { tangential_p1: -0.5, sigmas, ..solution.calibrations[0] };
+        let second = Calibration { camera_group: 9, tangential_p1: -0.5, sigmas, ..solution.calibrations[0] };
         solution.calibrations.push(second);
         solution.views[4].camera_group = 9;
         let html = section(&solution);
@@ -258,7 +260,7 @@ mod tests {
     }
 
     #[test]
-    fn one_calibration_is_every_groups() {
+    fn focal_lengths_of_views_are_told() {
         let (_, mut solution) = fixture::solved();
         solution.views[1].focal_px = Some(1000.0);
         solution.views[2].focal_px = Some(1250.5);

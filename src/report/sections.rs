@@ -167,7 +167,7 @@ pub fn convergence(solution: &Solution) -> String {
         single("Focal length of the best hypothesis (px)", over_steps(|record| record.focal_px), clip),
         single(
             "Cost of the best hypothesis (share of that without inliers)",
-            over_steps(|record| record.best_score),
+            over_steps(|record| record.best_cost),
             None,
         ),
     ];
@@ -263,9 +263,9 @@ fn proposal_times(solution: &Solution) -> String {
     }
     let sentence = |time: &ProposalTime| {
         let when = match time.seconds {
-            Some(seconds) => format!("{seconds:.2} s ({} steps)", time.iterations),
-            None if time.iterations == 0 => "not asked".to_owned(),
-            None => format!("never ({} steps)", time.iterations),
+            Some(seconds) => format!("{seconds:.2} s ({} steps)", time.steps),
+            None if time.steps == 0 => "not asked".to_owned(),
+            None => format!("never ({} steps)", time.steps),
         };
         format!("{} {when}", time.proposal.name())
     };
@@ -369,7 +369,7 @@ mod tests {
     fn proposals_that_never_sufficed_say_so() {
         let (_, mut solution) = fixture::solved();
         assert!(proposal_times(&solution).contains("uniform never (600 steps)"));
-        solution.proposal_times.iter_mut().for_each(|time| (time.seconds, time.iterations) = (None, 0));
+        solution.proposal_times.iter_mut().for_each(|time| (time.seconds, time.steps) = (None, 0));
         assert!(proposal_times(&solution).contains("uniform not asked"));
         solution.proposal_times.clear();
         assert!(proposal_times(&solution).is_empty());

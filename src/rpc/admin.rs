@@ -58,7 +58,7 @@ impl proto::admin_service_server::AdminService for Admin {
         let worker = &self.engine.options().worker_name;
         Caller::of(&request)?.audit("DrainServer", worker, &Ok(()));
         self.engine.ask_for_drain();
-        Ok(Response::new(proto::DrainServerResponse { worker: self.engine.options().worker_name.clone() }))
+        Ok(Response::new(proto::DrainServerResponse { server: self.engine.options().worker_name.clone() }))
     }
 }
 

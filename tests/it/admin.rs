@@ -68,9 +68,9 @@ async fn a_drained_server_gives_its_jobs_back_and_ends_with_0() {
     let mut jobs = connected(&server).await;
     let name = created(&mut jobs, lasting(10_000)).await;
     reaches(&mut jobs, &name, &[JobState::Running]).await;
-    let worker: Value = serde_json::from_str(&admin(&server, "drain").stdout).expect("JSON");
+    let drained: Value = serde_json::from_str(&admin(&server, "drain").stdout).expect("JSON");
     let expected = format!("-{}", server.running.0.id());
-    assert!(worker["worker"].as_str().is_some_and(|worker| worker.ends_with(&expected)), "{worker}");
+    assert!(drained["server"].as_str().is_some_and(|server| server.ends_with(&expected)), "{drained}");
     assert_eq!(tokio::task::block_in_place(|| server.running.wait()).code(), Some(0));
 
     let server = Serving::start(data.path());

@@ -413,7 +413,10 @@ fn an_input_is_uploaded_as_json_or_protobuf_and_solved() {
     let digest_of = |source: Value| {
         let job = post(&server, "/v1/tenants/-/jobs", &source).json();
         get(&server, &format!("{}/events", path_of(&job)));
-        get(&server, &format!("{}/result", path_of(&job))).json()["inputSha256"].as_str().expect("a digest").to_owned()
+        get(&server, &format!("{}/result", path_of(&job))).json()["inputContentSha256"]
+            .as_str()
+            .expect("a digest")
+            .to_owned()
     };
     let unnamed = |mut set: Value| {
         set["views"] = json!([{}, {}, {}]);

@@ -228,7 +228,7 @@ async fn a_job_that_takes_every_server_down_fails_and_tells_its_history() {
     assert_eq!(error.reason, "ATTEMPTS_EXHAUSTED");
     assert_eq!(error.attempts.len(), 2, "{error:?}");
     for (past, worker) in error.attempts.iter().zip(&workers) {
-        assert!(past.worker.ends_with(worker), "{} by {worker}", past.worker);
+        assert!(past.server.ends_with(worker), "{} by {worker}", past.server);
         assert_eq!(past.end(), proto::AttemptEnd::Lost);
         let (start, end) = (past.start_time.expect("a start"), past.end_time.expect("an end"));
         assert!((start.seconds, start.nanos) < (end.seconds, end.nanos));

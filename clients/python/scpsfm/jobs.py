@@ -133,7 +133,7 @@ class Progress:
     """The state of a running job."""
 
     stage: str
-    """`PREPARE`, `SEARCH`, `REFINE`, `CALIBRATE`, `JUDGE` or `EXTEND`."""
+    """`PREPARE`, `SEARCH`, `REFINE`, `CALIBRATE`, `EXTEND` or `CLASSIFY`."""
 
     fraction: float
     """Share of the work done, 0 to 1, never decreasing within an attempt."""
@@ -147,7 +147,7 @@ class Progress:
     focal_px: float | None
     """Current estimate of the focal length in pixels."""
 
-    best_score: float | None
+    best_cost: float | None
     """Cost of the best hypothesis so far: 0 is a perfect consensus of all tracks, 1 is none."""
 
     elapsed_seconds: float
@@ -175,7 +175,7 @@ class Progress:
             iteration_count=message.iteration_count,
             inlier_track_count=message.inlier_track_count,
             focal_px=optional(message, "focal_px"),
-            best_score=optional(message, "best_score"),
+            best_cost=optional(message, "best_cost"),
             elapsed_seconds=seconds(message.elapsed_duration),
             registered_view_count=message.reconstruction.registered_view_count,
             view_count=message.reconstruction.view_count,

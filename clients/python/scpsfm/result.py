@@ -6,7 +6,6 @@ up to the lens's distortion.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import Enum
 from functools import cached_property
@@ -130,8 +129,8 @@ class Calibration:
     OpenCV's model. Behind a fisheye s = t (1 + k1 t^2 + k2 t^4 + k3 t^6) / r with t = atan r, and p1 = p2 = 0.
     """
 
-    camera_group: int | None
-    """The group that it is of; `None`: of all groups together."""
+    camera_group: int
+    """The group that it is of."""
 
     focal_px: float
     """Horizontal focal length in pixels."""
@@ -296,8 +295,8 @@ class TrackResults:
     network_weight: NDArray[np.float32] | None
     """What a network says of the track by itself, 0 to 1; `None`: none ran. (tracks,)."""
 
-    second_structure: NDArray[np.bool_]
-    """True for rejected tracks that agree with the motion that `SECOND_STRUCTURE` reports. (tracks,)."""
+    second_structure_number: NDArray[np.int64]
+    """Which of the motions that `SECOND_STRUCTURE` reports a rejected track agrees with, from 1; 0: none. (tracks,)."""
 
     points: Floats
     """X, Y, Z of each track; NaN where it has no point. (tracks, 3)."""
@@ -467,7 +466,7 @@ class Result:
     def stage_seconds(self) -> dict[str, float]:
         """Time by stage, in the order in which they ran."""
         times: dict[str, float] = {}
-        for entry in self.message.stage_times:
+        for entry in self.message.stage_durations:
             stage = word(progress_pb2.Stage, entry.stage, "STAGE_")
             times[stage] = times.get(stage, 0.0) + seconds(entry.duration)
         return times
@@ -494,43 +493,23 @@ class Result:
 
     @cached_property
     def calibrations(self) -> tuple[Calibration, ...]:
-        """One entry a camera group, ascending; empty without a metric reconstruction."""
-        groups = self._groups
-        one = len(self.message.calibrations) == 1
-        if one and len(groups) != 1:
-            named: Sequence[int | None] = (None,)
-        elif len(groups) != len(self.message.calibrations) and not one and self.message.calibrations:
-            count = len(self.message.calibrations)
-            raise InternalError(
-                f"the result has {count} calibrations of {len(groups)} camera groups", reason="INVALID_RESULT"
-            )
-        else:
-            named = groups
-        return tuple(
-            _calibration(message, group) for message, group in zip(self.message.calibrations, named, strict=False)
-        )
+        """One entry a camera group that was calibrated, ascending; empty without a metric reconstruction."""
+        return tuple(_calibration(message) for message in self.message.calibrations)
 
     @cached_property
     def _first_calibration(self) -> Calibration | None:
         registered = {camera.camera_group for camera in self.cameras if camera.is_registered}
         if not registered:
             return None
-        seen = (found for found in self.calibrations if found.camera_group is None or found.camera_group in registered)
-        return next(seen, None)
-
-    @cached_property
-    def _groups(self) -> list[int]:
-        return sorted({view.camera_group for view in self.message.views})
+        return next((found for found in self.calibrations if found.camera_group in registered), None)
 
     @cached_property
     def cameras(self) -> tuple[Camera, ...]:
         """One entry a view of the input, registered or not."""
-        places = {group: place for place, group in enumerate(self._groups)}
+        calibrations = {calibration.camera_group: calibration for calibration in self.calibrations}
         cameras = []
         for index, view in enumerate(self.message.views):
-            calibration = None
-            if self.calibrations:
-                calibration = self.calibrations[places[view.camera_group] if len(self.calibrations) > 1 else 0]
+            calibration = calibrations.get(view.camera_group)
             has_pose = bool(view.rotation) and calibration is not None
             own = optional(view, "focal_px")
             focal = None if calibration is None or not has_pose else own if own is not None else calibration.focal_px
@@ -589,12 +568,12 @@ class Result:
         part[self.point_track_indices] = self.point_parts
         for row in (points, part):
             row.setflags(write=False)
-        network, second = message.network_weights, message.second_structures
+        network, second = message.network_weights, message.second_structure_numbers
         return TrackResults(
             weight=_row(message.weights, np.float32, count, "weights of tracks"),
             inlier=inlier,
             network_weight=_row(network, np.float32, count, "weights of a network") if network else None,
-            second_structure=_row(second or np.zeros(count), np.bool_, count, "tracks of a second structure"),
+            second_structure_number=_row(second or [0] * count, np.int64, count, "numbers of a second structure"),
             points=points,
             part=part,
         )
@@ -656,12 +635,12 @@ class Result:
         return self.input
 
 
-def _calibration(message: result_pb2.Calibration, group: int | None) -> Calibration:
+def _calibration(message: result_pb2.Calibration) -> Calibration:
     lens = word(result_pb2.LensProjection, message.lens_projection, "LENS_PROJECTION_")
     if lens.startswith("UNKNOWN"):
         raise InternalError(f"the lens is of a kind that this version does not know: {lens}", reason="INVALID_RESULT")
     return Calibration(
-        camera_group=group,
+        camera_group=message.camera_group,
         focal_px=message.focal_px,
         sigma_log_focal=optional(message, "sigma_log_focal"),
         principal_point_px=(message.principal_point_x_px, message.principal_point_y_px),

@@ -211,7 +211,7 @@ def test_nerfstudio_projects_to_the_same_pixels(small: scene.Scene, tmp_path: Pa
 def test_nerfstudio_frames_have_their_own_intrinsics_where_cameras_differ(small: scene.Scene, tmp_path: Path) -> None:
     message = scene.true_result(small)
     message.calibrations.add().CopyFrom(message.calibrations[0])
-    message.calibrations[1].focal_px = 77.0
+    message.calibrations[1].camera_group, message.calibrations[1].focal_px = 1, 77.0
     for view in message.views[4:]:
         view.camera_group = 1
     result = Result(message, small.tracks)

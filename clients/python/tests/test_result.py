@@ -31,10 +31,10 @@ def test_a_result_is_arrays(small: scene.Scene) -> None:
     assert np.array_equal(result.points, small.points[small.right])
     assert result.point_track_indices.tolist() == np.flatnonzero(small.right).tolist()
     assert result.tracks.network_weight is None
-    assert not result.tracks.second_structure.any()
+    assert not result.tracks.second_structure_number.any()
     message = scene.true_result(small)
-    message.tracks.second_structures.extend(~small.right)
-    assert np.array_equal(Result(message, small.tracks).tracks.second_structure, ~small.right)
+    message.tracks.second_structure_numbers.extend(2 * ~small.right)
+    assert np.array_equal(Result(message, small.tracks).tracks.second_structure_number, 2 * ~small.right)
     assert result.observations.inlier.shape == (len(small.tracks),)
     for array in (result.points, result.tracks.inlier, result.tracks.points, result.observations.residual_px):
         with pytest.raises(ValueError, match="read-only"):
@@ -101,8 +101,8 @@ def test_the_lens_distorts_as_the_proto_says(small: scene.Scene, fisheye: bool) 
 
 def test_calibrations_are_those_of_the_groups() -> None:
     message = result_pb2.JobResult(status=1, grade=2)
-    for focal in (100.0, 200.0):
-        message.calibrations.add(focal_px=focal, aspect=1.0, grade=2)
+    for group, focal in ((4, 100.0), (9, 200.0)):
+        message.calibrations.add(camera_group=group, focal_px=focal, aspect=1.0, grade=2)
     for group in (9, 4, 9):
         view = message.views.add(camera_group=group, translation=[0.0, 0.0, 1.0])
         view.rotation.extend(np.eye(3).ravel())
@@ -117,11 +117,12 @@ def test_calibrations_are_those_of_the_groups() -> None:
     assert Result(message).focal_px == 200.0
     message.views[1].projection.extend(range(12))
     assert Result(message).focal_px == 100.0
-    # Cameras that were solved as one.
+    # A group without a calibration has no other's.
     del message.calibrations[1]
-    merged = Result(message)
-    assert [calibration.camera_group for calibration in merged.calibrations] == [None]
-    assert [camera.focal_px for camera in merged.cameras] == [100.0, 100.0, 250.0]
+    alone = Result(message)
+    assert [calibration.camera_group for calibration in alone.calibrations] == [4]
+    assert [camera.focal_px for camera in alone.cameras] == [None, 100.0, None]
+    assert (alone.cameras[0].calibration, alone.cameras[0].R) == (None, None)
 
 
 def test_nothing_found_is_a_result_too() -> None:
@@ -163,7 +164,6 @@ def test_lengths_that_do_not_fit_are_told(small: scene.Scene) -> None:
         (lambda message: message.tracks.points.pop(), "coordinates of points"),
         (lambda message: message.tracks.weights.pop(), "weights of tracks"),
         (lambda message: message.tracks.point_track_indices.__setitem__(0, 120), "a track beyond its 120"),
-        (lambda message: message.calibrations.extend([message.calibrations[0]] * 2), "3 calibrations of 1"),
         (lambda message: message.observations.residuals_px.pop(), "residuals"),
         (lambda message: message.observations.judged.pop(), "verdicts"),
         (lambda message: setattr(message.calibrations[0], "lens_projection", 77), "lens is of a kind"),

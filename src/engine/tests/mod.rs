@@ -111,7 +111,7 @@ fn progress(iteration: u32) -> Progress {
         head: None,
         inliers: 2,
         focal_px: None,
-        best_score: None,
+        best_cost: None,
         elapsed_seconds: 0.0,
         reconstruction: ReconstructionProgress::default(),
     }
@@ -152,7 +152,7 @@ fn solution(input: &Input, call: u64) -> Solution {
         proposal_times: Vec::new(),
         history: vec![progress(1)],
         trained_network_sha256: None,
-        input_sha256: None,
+        input_content_sha256: None,
         joined_tracks: None,
     }
 }

@@ -10,7 +10,6 @@ use super::intrinsics::pinhole;
 use crate::domain::result::ViewResult;
 use crate::domain::{Calibration, Solution};
 use crate::formats::LabelledInput;
-use crate::formats::cameras_json::groups_of_views;
 use crate::formats::metric::shown;
 use crate::matrix_of_cameras;
 
@@ -54,13 +53,8 @@ pub enum Geometry {
 ///
 /// Empty where the result has no cameras, and for an input without COLMAP's keypoints.
 pub fn pairs(solution: &Solution, input: &LabelledInput) -> Vec<Pair> {
-    let groups = groups_of_views(solution);
-    let cameras: Vec<Option<Camera>> = (0..solution.views.len())
-        .map(|view| {
-            let calibration = groups.get(view).and_then(|&group| solution.calibrations.get(group));
-            Camera::of(&solution.views[view], calibration)
-        })
-        .collect();
+    let camera = |view: &ViewResult| Camera::of(view, solution.calibration_of(view.camera_group));
+    let cameras: Vec<Option<Camera>> = solution.views.iter().map(camera).collect();
     let matches = matches(solution, input, &cameras);
     let of_pair = |(views, matches): ([u32; 2], Vec<[u32; 2]>)| {
         let [first, second] = views.map(|view| view as usize);

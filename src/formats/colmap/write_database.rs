@@ -17,7 +17,6 @@ use super::intrinsics;
 use super::two_view::{self, Geometry, Pair};
 use crate::domain::{Calibration, Grade, Solution};
 use crate::formats::LabelledInput;
-use crate::formats::cameras_json::groups_of_views;
 use crate::formats::error::Problem;
 
 /// COLMAP's numbers of two-view configurations (`src/colmap/scene/two_view_geometry.h`).
@@ -49,11 +48,10 @@ pub fn write(target: &Path, solution: &Solution, input: &LabelledInput) -> Resul
 
 /// Model and parameters of each camera that has one calibration of grade METRIC or WEAK, by the database's id.
 fn cameras(solution: &Solution, input: &LabelledInput) -> BTreeMap<u32, (&'static str, Vec<f64>)> {
-    let groups = groups_of_views(solution);
     // `None`: its views have focal lengths of their own.
     let mut found: BTreeMap<u32, Option<(&'static str, Vec<f64>)>> = BTreeMap::new();
     for (view, result) in solution.views.iter().enumerate().filter(|(_, view)| view.rotation.is_some()) {
-        let calibration = groups.get(view).and_then(|&group| solution.calibrations.get(group));
+        let calibration = solution.calibration_of(result.camera_group);
         let (Some(of_group), Some(raw)) = (calibration, input.raw.views.get(view)) else { continue };
         if !matches!(of_group.grade.or(solution.grade), Some(Grade::Metric | Grade::Weak)) {
             continue;

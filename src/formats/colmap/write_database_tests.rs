@@ -42,6 +42,7 @@ impl Case {
             solution.tracks.point[track] = tracks.point[of];
         }
         solution.views.iter_mut().for_each(|view| view.camera_group = 4);
+        solution.calibrations.iter_mut().for_each(|calibration| calibration.camera_group = 4);
         Self { directory, input: LabelledInput { format: input.format, ..read }, solution }
     }
 

@@ -18,7 +18,7 @@ const GRADE_MEANS = {
 };
 const STAGES = {
   PREPARE: "Preparing", SEARCH: "Searching a consensus", REFINE: "Refining", EXTEND: "Registering further views",
-  CALIBRATE: "Calibrating", JUDGE: "Judging tracks and observations",
+  CALIBRATE: "Calibrating", CLASSIFY: "Classifying tracks and observations",
 };
 const TASKS = {
   ADJUST: "adjustment round", WINDOWS: "window", JUDGE: "verdict", CAMERAS: "camera group", HEADS: "network head",
@@ -877,7 +877,7 @@ class Live {
       if (phase) parts.push(`phase ${phase}`);
       parts.push(`sum of weights ${figure(head.weightSum || 0)}`);
     }
-    if (progress.bestScore !== undefined) parts.push(`cost ${figure(progress.bestScore, 3)} of all-outlier cost`);
+    if (progress.bestCost !== undefined) parts.push(`cost ${figure(progress.bestCost, 3)} of all-outlier cost`);
     parts.push(seconds(duration(progress.elapsedDuration)));
     return parts.join(" · ");
   }
@@ -961,7 +961,7 @@ function failureBox(job) {
   const attempts = job.error.attempts || [];
   const columns = [
     column("Attempt", (attempt) => count(attempt.attempt), "number"),
-    column("Worker", (attempt) => foreign(attempt.worker || "-"), "name"),
+    column("Server", (attempt) => foreign(attempt.server || "-"), "name"),
     column("Start", (attempt) => timeOf(attempt.startTime), "time"),
     column("End", (attempt) => timeOf(attempt.endTime), "time"),
     column("How it ended", (attempt) => ATTEMPT_ENDS[bare(attempt.end, "ATTEMPT_END")] || "-"),
@@ -1256,9 +1256,8 @@ function centreOf(view) {
   return [0, 1, 2].map((k) => -(R[k] * t[0] + R[3 + k] * t[1] + R[6 + k] * t[2]));
 }
 
-function calibrationTable(result, views) {
-  const groups = [...new Set(views.map((view) => view.cameraGroup || 0))].sort((a, b) => a - b);
-  const rows = (result.calibrations || []).map((calibration, place) => ({ ...calibration, group: groups[place] }));
+function calibrationTable(result) {
+  const rows = result.calibrations || [];
   const distortion = (row) => {
     const names = [
       ["k1", "radialK1"], ["k2", "radialK2"], ["k3", "radialK3"], ["p1", "tangentialP1"], ["p2", "tangentialP2"],
@@ -1268,7 +1267,7 @@ function calibrationTable(result, views) {
     return given.map(([name, field]) => `${name} ${withSigma(row[field], sigma(field))}`).join(", ") || "none";
   };
   const columns = [
-    column("Group", (row) => (row.group === undefined ? "-" : String(row.group)), "number"),
+    column("Group", (row) => String(row.cameraGroup || 0), "number"),
     column("Grade", (row) => bare(row.grade, "GRADE") || "-"),
     column("Focal length ± σ", (row) => focalWords(row.focalPx, row.sigmaLogFocal)[0], "number"),
     column("Principal point x", (row) =>
@@ -1336,7 +1335,7 @@ function resultSections(result, job) {
   return [
     make("section", { "aria-labelledby": "result-title" }, make("h3", { id: "result-title" }, "Result"),
       facts(pairs), isMore ? [make("h4", {}, "All warnings"), warningList(warnings)] : null,
-      make("h4", {}, "Cameras"), calibrationTable(result, views),
+      make("h4", {}, "Cameras"), calibrationTable(result),
       make("details", {}, make("summary", {}, `Views (${count(views.length)})`), viewTable(views)),
       make("details", {}, make("summary", {}, "Times"), table("Time by stage", times, result.stageTimes || []))),
     sceneSection(result, views),

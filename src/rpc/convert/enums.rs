@@ -58,9 +58,9 @@ macro_rules! twins {
 twins! {
     Method = Method { Auto, Paper, Geometry, Psfm, Scpsfm }
     Backend = Backend { Flex, Ndarray }
-    Stage = Stage { Prepare, Search, Refine, Calibrate, Extend, Judge }
+    Stage = Stage { Prepare, Search, Refine, Calibrate, Extend, Classify }
     Phase = Phase { Relaxation, Rank, Growth }
-    Task = Task { Adjust, Cameras, Windows, Judge, Heads }
+    Task = Task { Adjust, Cameras, Windows, Classify, Heads }
     Status = ResultStatus { Solved, NoReconstruction }
     Grade = Grade { Metric, Weak, ProjectiveOnly }
     LensProjection = LensProjection { Perspective, Fisheye }

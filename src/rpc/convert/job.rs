@@ -165,7 +165,7 @@ fn failure_from_wire(error: proto::JobError) -> Result<Failure, Violation> {
 fn past_attempt_to_wire(past: &PastAttempt) -> proto::PastAttempt {
     proto::PastAttempt {
         attempt: past.attempt,
-        worker: past.worker.clone(),
+        server: past.server.clone(),
         start_time: Some(past.start_time.into()),
         end_time: Some(past.end_time.into()),
         end: past.end.to_wire(),
@@ -176,7 +176,7 @@ fn past_attempt_from_wire(past: proto::PastAttempt) -> Result<PastAttempt, Viola
     let time = |time, field| time_from_wire(required(time, field)?, field);
     Ok(PastAttempt {
         attempt: past.attempt,
-        worker: past.worker,
+        server: past.server,
         start_time: time(past.start_time, "error.attempts.start_time")?,
         end_time: time(past.end_time, "error.attempts.end_time")?,
         end: AttemptEnd::required(past.end, "error.attempts.end")?,
@@ -258,7 +258,7 @@ mod tests {
             head: None,
             inliers: 4,
             focal_px: None,
-            best_score: Some(0.0),
+            best_cost: Some(0.0),
             elapsed_seconds: 2.0,
             reconstruction: ReconstructionProgress {
                 block: 1,
@@ -328,7 +328,7 @@ mod tests {
     fn events_survive_the_wire() {
         let past = |(attempt, end)| PastAttempt {
             attempt,
-            worker: format!("host-{attempt}"),
+            server: format!("host-{attempt}"),
             start_time: time(1),
             end_time: time(2),
             end,

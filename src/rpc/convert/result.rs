@@ -41,26 +41,26 @@ fn to_wire(name: &JobName, solution: &Solution) -> proto::JobResult {
         reprojection_mean_px: solution.reprojection_mean_px,
         warnings: warnings_to_wire(&solution.warnings),
         solve_duration: Some(duration_to_wire(solution.seconds)),
-        stage_times: solution
+        stage_durations: solution
             .stages
             .iter()
-            .map(|time| proto::StageTime {
+            .map(|time| proto::StageDuration {
                 stage: time.stage.to_wire(),
                 duration: Some(duration_to_wire(time.seconds)),
             })
             .collect(),
-        proposal_times: solution
+        proposal_durations: solution
             .proposal_times
             .iter()
-            .map(|time| proto::ProposalTime {
+            .map(|time| proto::ProposalDuration {
                 proposal: time.proposal.to_wire(),
                 duration: time.seconds.map(duration_to_wire),
-                iteration_count: time.iterations,
+                step_count: time.steps,
             })
             .collect(),
         progress_records: solution.history.iter().map(progress::to_wire).collect(),
         trained_network_sha256: digest_to_wire(solution.trained_network_sha256),
-        input_sha256: digest_to_wire(solution.input_sha256),
+        input_content_sha256: digest_to_wire(solution.input_content_sha256),
         joined_tracks: solution.joined_tracks.as_ref().map(joined_tracks_to_wire),
     }
 }
@@ -87,23 +87,23 @@ pub fn from_wire(result: proto::JobResult) -> Result<Solution, Violation> {
         warnings: warnings_from_wire(&result.warnings),
         seconds: seconds_from_wire(result.solve_duration, "solve_duration")?,
         stages: result
-            .stage_times
+            .stage_durations
             .iter()
             .filter_map(|time| Some((Stage::known(time.stage)?, time)))
             .map(|(stage, time)| {
-                Ok(StageTime { stage, seconds: seconds_from_wire(time.duration, "stage_times.duration")? })
+                Ok(StageTime { stage, seconds: seconds_from_wire(time.duration, "stage_durations.duration")? })
             })
             .collect::<Result<_, Violation>>()?,
         proposal_times: result
-            .proposal_times
+            .proposal_durations
             .iter()
             .filter_map(|time| Some((Proposal::known(time.proposal)?, time)))
             .map(|(proposal, time)| {
                 let seconds = match time.duration {
-                    Some(duration) => Some(seconds_from_wire(Some(duration), "proposal_times.duration")?),
+                    Some(duration) => Some(seconds_from_wire(Some(duration), "proposal_durations.duration")?),
                     None => None,
                 };
-                Ok(ProposalTime { proposal, seconds, iterations: time.iteration_count })
+                Ok(ProposalTime { proposal, seconds, steps: time.step_count })
             })
             .collect::<Result<_, Violation>>()?,
         history: result
@@ -112,7 +112,7 @@ pub fn from_wire(result: proto::JobResult) -> Result<Solution, Violation> {
             .filter_map(|record| progress::from_wire(record).transpose())
             .collect::<Result<_, _>>()?,
         trained_network_sha256: digest_from_wire(&result.trained_network_sha256, "trained_network_sha256")?,
-        input_sha256: digest_from_wire(&result.input_sha256, "input_sha256")?,
+        input_content_sha256: digest_from_wire(&result.input_content_sha256, "input_content_sha256")?,
         joined_tracks: result.joined_tracks.map(joined_tracks_from_wire).transpose()?,
     })
 }
@@ -150,6 +150,7 @@ pub(super) fn warnings_from_wire(warnings: &[proto::Warning]) -> Vec<Warning> {
 
 fn calibration_to_wire(calibration: &Calibration) -> proto::Calibration {
     proto::Calibration {
+        camera_group: calibration.camera_group,
         focal_px: calibration.focal_px,
         sigma_log_focal: calibration.sigma_log_focal,
         principal_point_x_px: calibration.principal_point_px[0],
@@ -175,6 +176,7 @@ fn calibration_to_wire(calibration: &Calibration) -> proto::Calibration {
 
 fn calibration_from_wire(calibration: &proto::Calibration) -> Result<Calibration, Violation> {
     Ok(Calibration {
+        camera_group: calibration.camera_group,
         focal_px: calibration.focal_px,
         sigma_log_focal: calibration.sigma_log_focal,
         principal_point_px: [calibration.principal_point_x_px, calibration.principal_point_y_px],
@@ -283,14 +285,14 @@ fn tracks_to_wire(tracks: &TrackResults) -> proto::TrackResults {
         } else {
             with_point().map(|(track, _)| tracks.part_of(track).unwrap_or(0)).collect()
         },
-        second_structures: tracks.second_structure.clone(),
+        second_structure_numbers: tracks.second_structure.clone(),
     }
 }
 
 fn tracks_from_wire(tracks: proto::TrackResults) -> Result<TrackResults, Violation> {
     let count = tracks.weights.len();
     let is_of_all = |length: usize| length == 0 || length == count;
-    let are_of_all = is_of_all(tracks.network_weights.len()) && is_of_all(tracks.second_structures.len());
+    let are_of_all = is_of_all(tracks.network_weights.len()) && is_of_all(tracks.second_structure_numbers.len());
     if tracks.inliers.len() != count || !are_of_all {
         return Err(Violation::of("tracks", format!("arrays of different lengths beside {count} weights")));
     }
@@ -316,14 +318,14 @@ fn tracks_from_wire(tracks: proto::TrackResults) -> Result<TrackResults, Violati
             *part = of;
         }
     }
-    let proto::TrackResults { weights, inliers, network_weights, second_structures, .. } = tracks;
+    let proto::TrackResults { weights, inliers, network_weights, second_structure_numbers, .. } = tracks;
     Ok(TrackResults {
         weight: weights,
         inlier: inliers,
         network_weight: network_weights,
         point,
         part,
-        second_structure: second_structures,
+        second_structure: second_structure_numbers,
     })
 }
 

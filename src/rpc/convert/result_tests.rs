@@ -29,7 +29,7 @@ pub(super) fn rich() -> Solution {
         }),
         inliers: 20,
         focal_px: Some(1200.5),
-        best_score: Some(0.9),
+        best_cost: Some(0.9),
         elapsed_seconds: 0.25,
         reconstruction: ReconstructionProgress {
             block: 1,
@@ -49,6 +49,7 @@ pub(super) fn rich() -> Solution {
         seed: u64::MAX,
         calibrations: vec![
             Calibration {
+                camera_group: 7,
                 focal_px: 1.0 / 3.0,
                 sigma_log_focal: Some(0.05),
                 principal_point_px: [499.5, 399.5],
@@ -96,7 +97,7 @@ pub(super) fn rich() -> Solution {
             network_weight: vec![0.1, 0.2, 0.3],
             point: vec![None, Some([1.0, -2.0, 3.5]), None],
             part: vec![0, 1, 0],
-            second_structure: vec![false, false, true],
+            second_structure: vec![0, 0, 2],
         },
         observations: ObservationResults {
             inlier: vec![true, false, false],
@@ -118,12 +119,12 @@ pub(super) fn rich() -> Solution {
         seconds: 1.5,
         stages: vec![StageTime { stage: Stage::Prepare, seconds: 0.1 }],
         proposal_times: vec![
-            ProposalTime { proposal: Proposal::Network, seconds: Some(0.5), iterations: 80 },
-            ProposalTime { proposal: Proposal::Uniform, seconds: None, iterations: 6000 },
+            ProposalTime { proposal: Proposal::Network, seconds: Some(0.5), steps: 80 },
+            ProposalTime { proposal: Proposal::Uniform, seconds: None, steps: 6000 },
         ],
-        history: vec![progress, Progress { losses: None, head: None, focal_px: None, best_score: None, ..progress }],
+        history: vec![progress, Progress { losses: None, head: None, focal_px: None, best_cost: None, ..progress }],
         trained_network_sha256: Some(Sha256Digest([0x5e; 32])),
-        input_sha256: Some(Sha256Digest([0xd1; 32])),
+        input_content_sha256: Some(Sha256Digest([0xd1; 32])),
         joined_tracks: Some(JoinedTracks {
             view: vec![0, 1, 0],
             track: vec![0, 0, 1],
@@ -172,13 +173,13 @@ fn a_malformed_answer_names_its_field() {
     assert_eq!(with(&|result| result.status = 0), "status");
     assert_eq!(with(&|result| result.grade = 9), "grade");
     assert_eq!(with(&|result| result.tracks = None), "tracks");
-    assert_eq!(with(&|result| result.input_sha256.truncate(31)), "input_sha256");
+    assert_eq!(with(&|result| result.input_content_sha256.truncate(31)), "input_content_sha256");
     assert_eq!(with(&|result| result.views[1].projection.truncate(5)), "views.projection[1]");
     let tracks = |result: &mut proto::JobResult, change: &dyn Fn(&mut proto::TrackResults)| {
         change(result.tracks.as_mut().expect("set"));
     };
     assert_eq!(with(&|result| tracks(result, &|tracks| tracks.inliers.truncate(1))), "tracks");
-    assert_eq!(with(&|result| tracks(result, &|tracks| tracks.second_structures.truncate(1))), "tracks");
+    assert_eq!(with(&|result| tracks(result, &|tracks| tracks.second_structure_numbers.truncate(1))), "tracks");
     assert_eq!(
         with(&|result| tracks(result, &|tracks| tracks.point_track_indices[0] = 3)),
         "tracks.point_track_indices[0]"
@@ -196,9 +197,9 @@ fn what_only_a_later_version_knows_is_left_out() {
     let mut expected = rich();
     result.winning_proposal = 99;
     expected.winning_proposal = None;
-    result.stage_times[0].stage = 99;
+    result.stage_durations[0].stage = 99;
     expected.stages.remove(0);
-    result.proposal_times[0].proposal = 99;
+    result.proposal_durations[0].proposal = 99;
     expected.proposal_times.remove(0);
     result.progress_records[0].stage = 99;
     expected.history.remove(0);

@@ -290,7 +290,7 @@ pub(in crate::store) async fn giving_back_is_free_and_vanishing_is_not(store: &d
     assert_eq!(failure.reason, ATTEMPTS_EXHAUSTED);
     let past = |attempt, start, end_time, end| PastAttempt {
         attempt,
-        worker: "worker".into(),
+        server: "worker".into(),
         start_time: time(start),
         end_time: time(end_time),
         end,

@@ -153,7 +153,7 @@ fn progress(iteration: u32) -> Progress {
         head: None,
         inliers: 12,
         focal_px: Some(1234.5),
-        best_score: Some(f64::INFINITY),
+        best_cost: Some(f64::INFINITY),
         elapsed_seconds: 0.25,
         reconstruction: ReconstructionProgress {
             registered_views: 7,

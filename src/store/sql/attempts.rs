@@ -175,7 +175,7 @@ async fn exhausted<C: Connection>(
         let ending = row.optional_text("ending")?.unwrap_or_default();
         Ok(PastAttempt {
             attempt: number(row, "attempt")?,
-            worker: row.text("worker")?,
+            server: row.text("worker")?,
             start_time: rows::time(row.integer("start_time")?),
             // One that is followed by another has ended, whatever is known of how.
             end_time: rows::time(row.optional_integer("end_time")?.unwrap_or(row.integer("start_time")?)),
@@ -186,7 +186,7 @@ async fn exhausted<C: Connection>(
     let told: Vec<String> = attempts
         .iter()
         .filter(|past| past.end == AttemptEnd::Lost)
-        .map(|past| format!("{} by {}", past.attempt, past.worker))
+        .map(|past| format!("{} by {}", past.attempt, past.server))
         .collect();
     let message = format!(
         "{lost_attempts} attempts ended without a word from their worker, at most {max_attempts} are made: {}",

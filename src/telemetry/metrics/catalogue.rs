@@ -26,7 +26,7 @@ pub struct Metric {
 const JOB_SECONDS: Kind =
     Kind::Histogram(&[0.05, 0.1, 0.25, 0.5, 1.0, 2.0, 3.0, 5.0, 8.0, 13.0, 30.0, 60.0, 120.0, 300.0, 600.0]);
 
-/// Seconds of one stage: `prepare` and `judge` take milliseconds, `search` most of a job.
+/// Seconds of one stage: `prepare` and `classify` take milliseconds, `search` most of a job.
 const STAGE_SECONDS: Kind =
     Kind::Histogram(&[0.001, 0.003, 0.01, 0.03, 0.1, 0.3, 1.0, 2.0, 3.0, 5.0, 10.0, 30.0, 60.0, 300.0]);
 

@@ -69,7 +69,7 @@ fn progress(fraction: f64) -> Progress {
         head: None,
         inliers: 3,
         focal_px: Some(1000.0),
-        best_score: Some(0.5),
+        best_cost: Some(0.5),
         elapsed_seconds: 0.0,
         reconstruction: ReconstructionProgress::default(),
     }
@@ -111,7 +111,7 @@ pub fn solution(input: &Input, settings: &SolveSettings) -> Solution {
         proposal_times: Vec::new(),
         history: Vec::new(),
         trained_network_sha256: None,
-        input_sha256: None,
+        input_content_sha256: None,
         joined_tracks: input.joined_tracks(),
     }
 }

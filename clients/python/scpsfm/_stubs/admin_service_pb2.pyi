@@ -26,10 +26,10 @@ class DrainServerRequest(_message.Message):
     def __init__(self) -> None: ...
 
 class DrainServerResponse(_message.Message):
-    __slots__ = ("worker",)
-    WORKER_FIELD_NUMBER: _ClassVar[int]
-    worker: str
-    def __init__(self, worker: _Optional[str] = ...) -> None: ...
+    __slots__ = ("server",)
+    SERVER_FIELD_NUMBER: _ClassVar[int]
+    server: str
+    def __init__(self, server: _Optional[str] = ...) -> None: ...
 
 class Queue(_message.Message):
     __slots__ = ("paused", "pause_time", "job_counts", "oldest_job", "oldest_queue_time", "tenants")

@@ -63,18 +63,18 @@ class JobError(_message.Message):
     def __init__(self, reason: _Optional[str] = ..., message: _Optional[str] = ..., attempts: _Optional[_Iterable[_Union[PastAttempt, _Mapping]]] = ...) -> None: ...
 
 class PastAttempt(_message.Message):
-    __slots__ = ("attempt", "worker", "start_time", "end_time", "end")
+    __slots__ = ("attempt", "server", "start_time", "end_time", "end")
     ATTEMPT_FIELD_NUMBER: _ClassVar[int]
-    WORKER_FIELD_NUMBER: _ClassVar[int]
+    SERVER_FIELD_NUMBER: _ClassVar[int]
     START_TIME_FIELD_NUMBER: _ClassVar[int]
     END_TIME_FIELD_NUMBER: _ClassVar[int]
     END_FIELD_NUMBER: _ClassVar[int]
     attempt: int
-    worker: str
+    server: str
     start_time: _timestamp_pb2.Timestamp
     end_time: _timestamp_pb2.Timestamp
     end: AttemptEnd
-    def __init__(self, attempt: _Optional[int] = ..., worker: _Optional[str] = ..., start_time: _Optional[_Union[_timestamp_pb2.Timestamp, _Mapping]] = ..., end_time: _Optional[_Union[_timestamp_pb2.Timestamp, _Mapping]] = ..., end: _Optional[_Union[AttemptEnd, str]] = ...) -> None: ...
+    def __init__(self, attempt: _Optional[int] = ..., server: _Optional[str] = ..., start_time: _Optional[_Union[_timestamp_pb2.Timestamp, _Mapping]] = ..., end_time: _Optional[_Union[_timestamp_pb2.Timestamp, _Mapping]] = ..., end: _Optional[_Union[AttemptEnd, str]] = ...) -> None: ...
 
 class JobSummary(_message.Message):
     __slots__ = ("status", "grade", "focal_px", "sigma_log_focal", "inlier_track_count", "registered_view_count", "reprojection_rms_px", "winning_proposal", "iteration_count", "solve_duration", "result_size_bytes", "warnings")

@@ -15,7 +15,7 @@ class Stage(int, metaclass=_enum_type_wrapper.EnumTypeWrapper):
     STAGE_SEARCH: _ClassVar[Stage]
     STAGE_REFINE: _ClassVar[Stage]
     STAGE_CALIBRATE: _ClassVar[Stage]
-    STAGE_JUDGE: _ClassVar[Stage]
+    STAGE_CLASSIFY: _ClassVar[Stage]
     STAGE_EXTEND: _ClassVar[Stage]
 
 class Phase(int, metaclass=_enum_type_wrapper.EnumTypeWrapper):
@@ -30,7 +30,7 @@ class Task(int, metaclass=_enum_type_wrapper.EnumTypeWrapper):
     TASK_UNSPECIFIED: _ClassVar[Task]
     TASK_ADJUST: _ClassVar[Task]
     TASK_WINDOWS: _ClassVar[Task]
-    TASK_JUDGE: _ClassVar[Task]
+    TASK_CLASSIFY: _ClassVar[Task]
     TASK_CAMERAS: _ClassVar[Task]
     TASK_HEADS: _ClassVar[Task]
 STAGE_UNSPECIFIED: Stage
@@ -38,7 +38,7 @@ STAGE_PREPARE: Stage
 STAGE_SEARCH: Stage
 STAGE_REFINE: Stage
 STAGE_CALIBRATE: Stage
-STAGE_JUDGE: Stage
+STAGE_CLASSIFY: Stage
 STAGE_EXTEND: Stage
 PHASE_UNSPECIFIED: Phase
 PHASE_RELAXATION: Phase
@@ -47,7 +47,7 @@ PHASE_GROWTH: Phase
 TASK_UNSPECIFIED: Task
 TASK_ADJUST: Task
 TASK_WINDOWS: Task
-TASK_JUDGE: Task
+TASK_CLASSIFY: Task
 TASK_CAMERAS: Task
 TASK_HEADS: Task
 
@@ -100,14 +100,14 @@ class ReconstructionProgress(_message.Message):
     def __init__(self, block: _Optional[int] = ..., block_count: _Optional[int] = ..., part: _Optional[int] = ..., registered_view_count: _Optional[int] = ..., view_count: _Optional[int] = ..., task: _Optional[_Union[Task, str]] = ..., step: _Optional[int] = ..., step_count: _Optional[int] = ...) -> None: ...
 
 class Progress(_message.Message):
-    __slots__ = ("stage", "fraction", "iteration_count", "losses", "inlier_track_count", "focal_px", "best_score", "elapsed_duration", "reconstruction", "head")
+    __slots__ = ("stage", "fraction", "iteration_count", "losses", "inlier_track_count", "focal_px", "best_cost", "elapsed_duration", "reconstruction", "head")
     STAGE_FIELD_NUMBER: _ClassVar[int]
     FRACTION_FIELD_NUMBER: _ClassVar[int]
     ITERATION_COUNT_FIELD_NUMBER: _ClassVar[int]
     LOSSES_FIELD_NUMBER: _ClassVar[int]
     INLIER_TRACK_COUNT_FIELD_NUMBER: _ClassVar[int]
     FOCAL_PX_FIELD_NUMBER: _ClassVar[int]
-    BEST_SCORE_FIELD_NUMBER: _ClassVar[int]
+    BEST_COST_FIELD_NUMBER: _ClassVar[int]
     ELAPSED_DURATION_FIELD_NUMBER: _ClassVar[int]
     RECONSTRUCTION_FIELD_NUMBER: _ClassVar[int]
     HEAD_FIELD_NUMBER: _ClassVar[int]
@@ -117,8 +117,8 @@ class Progress(_message.Message):
     losses: Losses
     inlier_track_count: int
     focal_px: float
-    best_score: float
+    best_cost: float
     elapsed_duration: _duration_pb2.Duration
     reconstruction: ReconstructionProgress
     head: HeadProgress
-    def __init__(self, stage: _Optional[_Union[Stage, str]] = ..., fraction: _Optional[float] = ..., iteration_count: _Optional[int] = ..., losses: _Optional[_Union[Losses, _Mapping]] = ..., inlier_track_count: _Optional[int] = ..., focal_px: _Optional[float] = ..., best_score: _Optional[float] = ..., elapsed_duration: _Optional[_Union[_duration_pb2.Duration, _Mapping]] = ..., reconstruction: _Optional[_Union[ReconstructionProgress, _Mapping]] = ..., head: _Optional[_Union[HeadProgress, _Mapping]] = ...) -> None: ...
+    def __init__(self, stage: _Optional[_Union[Stage, str]] = ..., fraction: _Optional[float] = ..., iteration_count: _Optional[int] = ..., losses: _Optional[_Union[Losses, _Mapping]] = ..., inlier_track_count: _Optional[int] = ..., focal_px: _Optional[float] = ..., best_cost: _Optional[float] = ..., elapsed_duration: _Optional[_Union[_duration_pb2.Duration, _Mapping]] = ..., reconstruction: _Optional[_Union[ReconstructionProgress, _Mapping]] = ..., head: _Optional[_Union[HeadProgress, _Mapping]] = ...) -> None: ...

@@ -131,7 +131,8 @@ class LeftOut(_message.Message):
     def __init__(self, reason: _Optional[_Union[LeftOutReason, str]] = ..., point_count: _Optional[int] = ..., agreeing_point_count: _Optional[int] = ...) -> None: ...
 
 class Calibration(_message.Message):
-    __slots__ = ("focal_px", "sigma_log_focal", "principal_point_x_px", "principal_point_y_px", "aspect", "radial_k1", "radial_k2", "radial_k3", "tangential_p1", "tangential_p2", "lens_projection", "grade", "sigma_principal_point_x_px", "sigma_principal_point_y_px", "sigma_aspect", "sigma_radial_k1", "sigma_radial_k2", "sigma_radial_k3", "sigma_tangential_p1", "sigma_tangential_p2")
+    __slots__ = ("camera_group", "focal_px", "sigma_log_focal", "principal_point_x_px", "principal_point_y_px", "aspect", "radial_k1", "radial_k2", "radial_k3", "tangential_p1", "tangential_p2", "lens_projection", "grade", "sigma_principal_point_x_px", "sigma_principal_point_y_px", "sigma_aspect", "sigma_radial_k1", "sigma_radial_k2", "sigma_radial_k3", "sigma_tangential_p1", "sigma_tangential_p2")
+    CAMERA_GROUP_FIELD_NUMBER: _ClassVar[int]
     FOCAL_PX_FIELD_NUMBER: _ClassVar[int]
     SIGMA_LOG_FOCAL_FIELD_NUMBER: _ClassVar[int]
     PRINCIPAL_POINT_X_PX_FIELD_NUMBER: _ClassVar[int]
@@ -152,6 +153,7 @@ class Calibration(_message.Message):
     SIGMA_RADIAL_K3_FIELD_NUMBER: _ClassVar[int]
     SIGMA_TANGENTIAL_P1_FIELD_NUMBER: _ClassVar[int]
     SIGMA_TANGENTIAL_P2_FIELD_NUMBER: _ClassVar[int]
+    camera_group: int
     focal_px: float
     sigma_log_focal: float
     principal_point_x_px: float
@@ -172,7 +174,7 @@ class Calibration(_message.Message):
     sigma_radial_k3: float
     sigma_tangential_p1: float
     sigma_tangential_p2: float
-    def __init__(self, focal_px: _Optional[float] = ..., sigma_log_focal: _Optional[float] = ..., principal_point_x_px: _Optional[float] = ..., principal_point_y_px: _Optional[float] = ..., aspect: _Optional[float] = ..., radial_k1: _Optional[float] = ..., radial_k2: _Optional[float] = ..., radial_k3: _Optional[float] = ..., tangential_p1: _Optional[float] = ..., tangential_p2: _Optional[float] = ..., lens_projection: _Optional[_Union[LensProjection, str]] = ..., grade: _Optional[_Union[Grade, str]] = ..., sigma_principal_point_x_px: _Optional[float] = ..., sigma_principal_point_y_px: _Optional[float] = ..., sigma_aspect: _Optional[float] = ..., sigma_radial_k1: _Optional[float] = ..., sigma_radial_k2: _Optional[float] = ..., sigma_radial_k3: _Optional[float] = ..., sigma_tangential_p1: _Optional[float] = ..., sigma_tangential_p2: _Optional[float] = ...) -> None: ...
+    def __init__(self, camera_group: _Optional[int] = ..., focal_px: _Optional[float] = ..., sigma_log_focal: _Optional[float] = ..., principal_point_x_px: _Optional[float] = ..., principal_point_y_px: _Optional[float] = ..., aspect: _Optional[float] = ..., radial_k1: _Optional[float] = ..., radial_k2: _Optional[float] = ..., radial_k3: _Optional[float] = ..., tangential_p1: _Optional[float] = ..., tangential_p2: _Optional[float] = ..., lens_projection: _Optional[_Union[LensProjection, str]] = ..., grade: _Optional[_Union[Grade, str]] = ..., sigma_principal_point_x_px: _Optional[float] = ..., sigma_principal_point_y_px: _Optional[float] = ..., sigma_aspect: _Optional[float] = ..., sigma_radial_k1: _Optional[float] = ..., sigma_radial_k2: _Optional[float] = ..., sigma_radial_k3: _Optional[float] = ..., sigma_tangential_p1: _Optional[float] = ..., sigma_tangential_p2: _Optional[float] = ...) -> None: ...
 
 class PlaneAtInfinity(_message.Message):
     __slots__ = ("x", "y", "z")
@@ -205,22 +207,22 @@ class ViewResult(_message.Message):
     def __init__(self, projection: _Optional[_Iterable[float]] = ..., rotation: _Optional[_Iterable[float]] = ..., translation: _Optional[_Iterable[float]] = ..., focal_px: _Optional[float] = ..., part: _Optional[int] = ..., camera_group: _Optional[int] = ..., left_out: _Optional[_Union[LeftOut, _Mapping]] = ..., name: _Optional[str] = ...) -> None: ...
 
 class TrackResults(_message.Message):
-    __slots__ = ("weights", "inliers", "network_weights", "point_track_indices", "points", "point_parts", "second_structures")
+    __slots__ = ("weights", "inliers", "network_weights", "point_track_indices", "points", "point_parts", "second_structure_numbers")
     WEIGHTS_FIELD_NUMBER: _ClassVar[int]
     INLIERS_FIELD_NUMBER: _ClassVar[int]
     NETWORK_WEIGHTS_FIELD_NUMBER: _ClassVar[int]
     POINT_TRACK_INDICES_FIELD_NUMBER: _ClassVar[int]
     POINTS_FIELD_NUMBER: _ClassVar[int]
     POINT_PARTS_FIELD_NUMBER: _ClassVar[int]
-    SECOND_STRUCTURES_FIELD_NUMBER: _ClassVar[int]
+    SECOND_STRUCTURE_NUMBERS_FIELD_NUMBER: _ClassVar[int]
     weights: _containers.RepeatedScalarFieldContainer[float]
     inliers: _containers.RepeatedScalarFieldContainer[bool]
     network_weights: _containers.RepeatedScalarFieldContainer[float]
     point_track_indices: _containers.RepeatedScalarFieldContainer[int]
     points: _containers.RepeatedScalarFieldContainer[float]
     point_parts: _containers.RepeatedScalarFieldContainer[int]
-    second_structures: _containers.RepeatedScalarFieldContainer[bool]
-    def __init__(self, weights: _Optional[_Iterable[float]] = ..., inliers: _Optional[_Iterable[bool]] = ..., network_weights: _Optional[_Iterable[float]] = ..., point_track_indices: _Optional[_Iterable[int]] = ..., points: _Optional[_Iterable[float]] = ..., point_parts: _Optional[_Iterable[int]] = ..., second_structures: _Optional[_Iterable[bool]] = ...) -> None: ...
+    second_structure_numbers: _containers.RepeatedScalarFieldContainer[int]
+    def __init__(self, weights: _Optional[_Iterable[float]] = ..., inliers: _Optional[_Iterable[bool]] = ..., network_weights: _Optional[_Iterable[float]] = ..., point_track_indices: _Optional[_Iterable[int]] = ..., points: _Optional[_Iterable[float]] = ..., point_parts: _Optional[_Iterable[int]] = ..., second_structure_numbers: _Optional[_Iterable[int]] = ...) -> None: ...
 
 class ObservationResults(_message.Message):
     __slots__ = ("inliers", "judged", "residuals_px", "weights", "split_numbers")
@@ -262,7 +264,7 @@ class JoinedTracks(_message.Message):
     cut_match_count: int
     def __init__(self, view_indices: _Optional[_Iterable[int]] = ..., track_indices: _Optional[_Iterable[int]] = ..., keypoint_indices: _Optional[_Iterable[int]] = ..., match_count: _Optional[int] = ..., cut_match_count: _Optional[int] = ...) -> None: ...
 
-class StageTime(_message.Message):
+class StageDuration(_message.Message):
     __slots__ = ("stage", "duration")
     STAGE_FIELD_NUMBER: _ClassVar[int]
     DURATION_FIELD_NUMBER: _ClassVar[int]
@@ -270,18 +272,18 @@ class StageTime(_message.Message):
     duration: _duration_pb2.Duration
     def __init__(self, stage: _Optional[_Union[_progress_pb2.Stage, str]] = ..., duration: _Optional[_Union[_duration_pb2.Duration, _Mapping]] = ...) -> None: ...
 
-class ProposalTime(_message.Message):
-    __slots__ = ("proposal", "duration", "iteration_count")
+class ProposalDuration(_message.Message):
+    __slots__ = ("proposal", "duration", "step_count")
     PROPOSAL_FIELD_NUMBER: _ClassVar[int]
     DURATION_FIELD_NUMBER: _ClassVar[int]
-    ITERATION_COUNT_FIELD_NUMBER: _ClassVar[int]
+    STEP_COUNT_FIELD_NUMBER: _ClassVar[int]
     proposal: Proposal
     duration: _duration_pb2.Duration
-    iteration_count: int
-    def __init__(self, proposal: _Optional[_Union[Proposal, str]] = ..., duration: _Optional[_Union[_duration_pb2.Duration, _Mapping]] = ..., iteration_count: _Optional[int] = ...) -> None: ...
+    step_count: int
+    def __init__(self, proposal: _Optional[_Union[Proposal, str]] = ..., duration: _Optional[_Union[_duration_pb2.Duration, _Mapping]] = ..., step_count: _Optional[int] = ...) -> None: ...
 
 class JobResult(_message.Message):
-    __slots__ = ("job", "server_version", "status", "grade", "method", "winning_proposal", "iteration_count", "seed", "calibrations", "plane_at_infinity", "views", "tracks", "observations", "track_splits", "noise_px", "reprojection_rms_px", "reprojection_mean_px", "warnings", "solve_duration", "stage_times", "proposal_times", "progress_records", "trained_network_sha256", "input_sha256", "joined_tracks")
+    __slots__ = ("job", "server_version", "status", "grade", "method", "winning_proposal", "iteration_count", "seed", "calibrations", "plane_at_infinity", "views", "tracks", "observations", "track_splits", "noise_px", "reprojection_rms_px", "reprojection_mean_px", "warnings", "solve_duration", "stage_durations", "proposal_durations", "progress_records", "trained_network_sha256", "input_content_sha256", "joined_tracks")
     JOB_FIELD_NUMBER: _ClassVar[int]
     SERVER_VERSION_FIELD_NUMBER: _ClassVar[int]
     STATUS_FIELD_NUMBER: _ClassVar[int]
@@ -301,11 +303,11 @@ class JobResult(_message.Message):
     REPROJECTION_MEAN_PX_FIELD_NUMBER: _ClassVar[int]
     WARNINGS_FIELD_NUMBER: _ClassVar[int]
     SOLVE_DURATION_FIELD_NUMBER: _ClassVar[int]
-    STAGE_TIMES_FIELD_NUMBER: _ClassVar[int]
-    PROPOSAL_TIMES_FIELD_NUMBER: _ClassVar[int]
+    STAGE_DURATIONS_FIELD_NUMBER: _ClassVar[int]
+    PROPOSAL_DURATIONS_FIELD_NUMBER: _ClassVar[int]
     PROGRESS_RECORDS_FIELD_NUMBER: _ClassVar[int]
     TRAINED_NETWORK_SHA256_FIELD_NUMBER: _ClassVar[int]
-    INPUT_SHA256_FIELD_NUMBER: _ClassVar[int]
+    INPUT_CONTENT_SHA256_FIELD_NUMBER: _ClassVar[int]
     JOINED_TRACKS_FIELD_NUMBER: _ClassVar[int]
     job: str
     server_version: str
@@ -326,10 +328,10 @@ class JobResult(_message.Message):
     reprojection_mean_px: float
     warnings: _containers.RepeatedCompositeFieldContainer[Warning]
     solve_duration: _duration_pb2.Duration
-    stage_times: _containers.RepeatedCompositeFieldContainer[StageTime]
-    proposal_times: _containers.RepeatedCompositeFieldContainer[ProposalTime]
+    stage_durations: _containers.RepeatedCompositeFieldContainer[StageDuration]
+    proposal_durations: _containers.RepeatedCompositeFieldContainer[ProposalDuration]
     progress_records: _containers.RepeatedCompositeFieldContainer[_progress_pb2.Progress]
     trained_network_sha256: bytes
-    input_sha256: bytes
+    input_content_sha256: bytes
     joined_tracks: JoinedTracks
-    def __init__(self, job: _Optional[str] = ..., server_version: _Optional[str] = ..., status: _Optional[_Union[ResultStatus, str]] = ..., grade: _Optional[_Union[Grade, str]] = ..., method: _Optional[_Union[_settings_pb2.Method, str]] = ..., winning_proposal: _Optional[_Union[Proposal, str]] = ..., iteration_count: _Optional[int] = ..., seed: _Optional[int] = ..., calibrations: _Optional[_Iterable[_Union[Calibration, _Mapping]]] = ..., plane_at_infinity: _Optional[_Union[PlaneAtInfinity, _Mapping]] = ..., views: _Optional[_Iterable[_Union[ViewResult, _Mapping]]] = ..., tracks: _Optional[_Union[TrackResults, _Mapping]] = ..., observations: _Optional[_Union[ObservationResults, _Mapping]] = ..., track_splits: _Optional[_Iterable[_Union[TrackSplit, _Mapping]]] = ..., noise_px: _Optional[float] = ..., reprojection_rms_px: _Optional[float] = ..., reprojection_mean_px: _Optional[float] = ..., warnings: _Optional[_Iterable[_Union[Warning, _Mapping]]] = ..., solve_duration: _Optional[_Union[_duration_pb2.Duration, _Mapping]] = ..., stage_times: _Optional[_Iterable[_Union[StageTime, _Mapping]]] = ..., proposal_times: _Optional[_Iterable[_Union[ProposalTime, _Mapping]]] = ..., progress_records: _Optional[_Iterable[_Union[_progress_pb2.Progress, _Mapping]]] = ..., trained_network_sha256: _Optional[bytes] = ..., input_sha256: _Optional[bytes] = ..., joined_tracks: _Optional[_Union[JoinedTracks, _Mapping]] = ...) -> None: ...
+    def __init__(self, job: _Optional[str] = ..., server_version: _Optional[str] = ..., status: _Optional[_Union[ResultStatus, str]] = ..., grade: _Optional[_Union[Grade, str]] = ..., method: _Optional[_Union[_settings_pb2.Method, str]] = ..., winning_proposal: _Optional[_Union[Proposal, str]] = ..., iteration_count: _Optional[int] = ..., seed: _Optional[int] = ..., calibrations: _Optional[_Iterable[_Union[Calibration, _Mapping]]] = ..., plane_at_infinity: _Optional[_Union[PlaneAtInfinity, _Mapping]] = ..., views: _Optional[_Iterable[_Union[ViewResult, _Mapping]]] = ..., tracks: _Optional[_Union[TrackResults, _Mapping]] = ..., observations: _Optional[_Union[ObservationResults, _Mapping]] = ..., track_splits: _Optional[_Iterable[_Union[TrackSplit, _Mapping]]] = ..., noise_px: _Optional[float] = ..., reprojection_rms_px: _Optional[float] = ..., reprojection_mean_px: _Optional[float] = ..., warnings: _Optional[_Iterable[_Union[Warning, _Mapping]]] = ..., solve_duration: _Optional[_Union[_duration_pb2.Duration, _Mapping]] = ..., stage_durations: _Optional[_Iterable[_Union[StageDuration, _Mapping]]] = ..., proposal_durations: _Optional[_Iterable[_Union[ProposalDuration, _Mapping]]] = ..., progress_records: _Optional[_Iterable[_Union[_progress_pb2.Progress, _Mapping]]] = ..., trained_network_sha256: _Optional[bytes] = ..., input_content_sha256: _Optional[bytes] = ..., joined_tracks: _Optional[_Union[JoinedTracks, _Mapping]] = ...) -> None: ...

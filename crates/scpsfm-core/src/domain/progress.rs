@@ -16,14 +16,14 @@ pub enum Stage {
     Calibrate,
     /// Registering the other views of a sequence against the block that was solved.
     Extend,
-    /// Judging every track and observation under the final geometry.
-    Judge,
+    /// Classification of every track and observation under the final geometry.
+    Classify,
 }
 
 impl Stage {
     /// Every stage in the order in which a solve passes them first; an extension is calibrated once more.
     pub const ALL: [Stage; 6] =
-        [Stage::Prepare, Stage::Search, Stage::Refine, Stage::Calibrate, Stage::Extend, Stage::Judge];
+        [Stage::Prepare, Stage::Search, Stage::Refine, Stage::Calibrate, Stage::Extend, Stage::Classify];
 
     /// The stage's name in files, metrics and logs.
     pub fn name(self) -> &'static str {
@@ -33,7 +33,7 @@ impl Stage {
             Stage::Refine => "refine",
             Stage::Calibrate => "calibrate",
             Stage::Extend => "extend",
-            Stage::Judge => "judge",
+            Stage::Classify => "classify",
         }
     }
 }
@@ -120,8 +120,8 @@ pub enum Task {
     Cameras,
     /// Asking windows of the sequence what focal length each sees; steps are windows.
     Windows,
-    /// Judging; steps are verdicts, up to two a track.
-    Judge,
+    /// Classifying; steps are verdicts, up to two a track.
+    Classify,
     /// Optimising the network from new weights; steps are heads.
     Heads,
 }
@@ -173,7 +173,7 @@ pub struct Progress {
     pub focal_px: Option<f64>,
     /// Truncated cost of the best hypothesis so far, as a share of the cost of calling every track an outlier:
     /// 0 is a perfect consensus of all tracks, 1 is none.
-    pub best_score: Option<f64>,
+    pub best_cost: Option<f64>,
     /// Seconds since the attempt began.
     pub elapsed_seconds: f64,
     pub reconstruction: ReconstructionProgress,

@@ -119,6 +119,8 @@ pub enum LensProjection {
 /// coefficient is 0 (all: a pinhole, or an equidistant fisheye) unless the data asked for more.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 pub struct Calibration {
+    /// The group, by the input's number.
+    pub camera_group: u32,
     /// Horizontal focal length; the geometric mean where every view has its own, see [`ViewResult::focal_px`].
     pub focal_px: f64,
     /// One standard deviation of the natural logarithm of the focal length; `None`: unobservable (infinite). Where
@@ -162,9 +164,10 @@ pub struct Sigmas {
 }
 
 impl Calibration {
-    /// Square pixels, no distortion and no uncertainty.
+    /// Of group 0, with square pixels, no distortion and no uncertainty.
     pub fn pinhole(focal_px: f64, principal_point_px: [f64; 2]) -> Self {
         Self {
+            camera_group: 0,
             focal_px,
             sigma_log_focal: None,
             principal_point_px,
@@ -245,8 +248,9 @@ pub struct TrackResults {
     pub point: Vec<Option<[f64; 3]>>,
     /// Reconstruction in whose frame each track's point is, see [`ViewResult::part`]; empty: all are in that of part 0.
     pub part: Vec<u32>,
-    /// Whether each track, rejected, agrees with the rigid motion that `SECOND_STRUCTURE` reports; empty where none is.
-    pub second_structure: Vec<bool>,
+    /// Which of the rigid motions that `SECOND_STRUCTURE` reports each track, rejected, agrees with: from 1, 0 for none;
+    /// empty where none is reported.
+    pub second_structure: Vec<u32>,
 }
 
 impl TrackResults {
@@ -310,14 +314,14 @@ pub struct StageTime {
     pub seconds: f64,
 }
 
-/// When a proposal, verified alone, first stood at a consensus as good as the accepted one.
+/// How long a proposal, verified alone, took to a consensus as good as the accepted one.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 pub struct ProposalTime {
     pub proposal: Proposal,
     /// Seconds of that proposal's own work, proposing and verifying; `None`: it never did within the search.
     pub seconds: Option<f64>,
-    /// Network iterations (network) or hypotheses (others) it had used by then.
-    pub iterations: u32,
+    /// Steps of its own that it had taken by then: iterations of the network, hypotheses of the others.
+    pub steps: u32,
 }
 
 /// Result of a solve.
@@ -332,7 +336,8 @@ pub struct Solution {
     /// Network iterations spent.
     pub iterations: u32,
     pub seed: u64,
-    /// One entry a camera group; empty without a metric reconstruction: see [`Solution::is_metric`].
+    /// One entry a camera group that was calibrated, ascending; empty without a metric reconstruction: see
+    /// [`Solution::is_metric`].
     pub calibrations: Vec<Calibration>,
     /// Plane at infinity `(n, 1)` in pixels and in the frame `P1 = [I|0]` of the first registered view.
     pub plane_at_infinity: Option<[f64; 3]>,
@@ -357,7 +362,7 @@ pub struct Solution {
     /// Of the trained network that AUTO had at hand; `None` where it was not to be asked.
     pub trained_network_sha256: Option<Sha256Digest>,
     /// [`RawInput::sha256`](super::RawInput::sha256) of the input; `None` before it was hashed.
-    pub input_sha256: Option<Sha256Digest>,
+    pub input_content_sha256: Option<Sha256Digest>,
     /// Which keypoint each observation is, of an input that was joined from matches; `None` for others.
     pub joined_tracks: Option<JoinedTracks>,
 }
@@ -387,15 +392,15 @@ impl Solution {
     /// Points of the curves in a report; more than a plot has pixels for is waste.
     pub const MAX_HISTORY: usize = 500;
 
-    /// The camera groups of the views, ascending, and the calibration of each. A single calibration is every group's;
-    /// none: there is no metric reconstruction.
+    /// The camera groups of the views, ascending, and the calibration of each that has one.
     pub fn cameras(&self) -> Vec<(u32, Option<&Calibration>)> {
         let groups: BTreeSet<u32> = self.views.iter().map(|view| view.camera_group).collect();
-        let of = |place: usize| match self.calibrations.as_slice() {
-            [only] => Some(only),
-            several => several.get(place),
-        };
-        groups.into_iter().enumerate().map(|(place, group)| (group, of(place))).collect()
+        groups.into_iter().map(|group| (group, self.calibration_of(group))).collect()
+    }
+
+    /// The calibration of a camera group; `None`: it has none.
+    pub fn calibration_of(&self, camera_group: u32) -> Option<&Calibration> {
+        self.calibrations.iter().find(|calibration| calibration.camera_group == camera_group)
     }
 
     /// The calibration of the first camera group that has registered views.

@@ -84,7 +84,7 @@ impl Assembled {
             (Some(reconstruction), Some(seed)) => (reconstruction, seed),
             (_, seed) => return Err(Unsolved { seed }),
         };
-        recorder.enter(Stage::Judge);
+        recorder.enter(Stage::Classify);
         let judged = seed.judged.take().unwrap_or_else(|| reconstruction.judged(problem, &seed, recorder));
         Ok(Self { reconstruction, seed: *seed, judged, evidence })
     }
@@ -315,7 +315,7 @@ fn nothing(problem: &Problem, attempt: Option<&Attempt>, warnings: Vec<Warning>,
         proposal_times: attempt.map_or_else(Vec::new, |attempt| attempt.found.proposal_times.clone()),
         history,
         trained_network_sha256: None,
-        input_sha256: None,
+        input_content_sha256: None,
         joined_tracks: None,
     }
 }
@@ -402,12 +402,13 @@ fn dehomogenise(point: &Point) -> Option<[f64; 3]> {
     scaled.iter().all(|entry| entry.is_finite()).then(|| scaled.into())
 }
 
-/// One calibration in pixels, its principal point about the image centre of this view.
+/// The calibration of this view's camera group in pixels, its principal point about the image centre of the view.
 ///
 /// * `outcome`: says what it is worth
 fn pixel_calibration(intrinsics: &Intrinsics, outcome: &Outcome, problem: &Problem, view: usize) -> Calibration {
     let offset = intrinsics.principal_point * problem.scale_px;
     Calibration {
+        camera_group: problem.input.views()[view].camera_group,
         focal_px: intrinsics.focal * problem.scale_px,
         sigma_log_focal: outcome.sigma_log_focal,
         principal_point_px: (problem.normalization.centres_px[view] + offset).into(),

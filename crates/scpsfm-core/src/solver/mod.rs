@@ -114,7 +114,7 @@ pub fn solve_on(
         })?,
     };
     views::complete(&mut solution, input);
-    solution.input_sha256 = Some(input.to_raw().sha256());
+    solution.input_content_sha256 = Some(input.to_raw().sha256());
     solution.joined_tracks = input.joined_tracks();
     solution.trained_network_sha256 = learned::may_be_asked(settings).then(trained_network_sha256);
     Ok(solution)

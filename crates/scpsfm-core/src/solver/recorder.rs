@@ -14,7 +14,7 @@ fn fraction_at(stage: Stage) -> f64 {
         Stage::Refine => 0.85,
         Stage::Calibrate => 0.93,
         Stage::Extend => 0.97,
-        Stage::Judge => 0.98,
+        Stage::Classify => 0.98,
     }
 }
 
@@ -26,7 +26,7 @@ fn fraction_of_extension_at(stage: Stage) -> f64 {
     match stage {
         Stage::Prepare | Stage::Search | Stage::Refine | Stage::Extend => 0.0,
         Stage::Calibrate => 0.85,
-        Stage::Judge => 0.95,
+        Stage::Classify => 0.95,
     }
 }
 
@@ -44,7 +44,7 @@ pub struct HypothesisState {
     pub head: Option<HeadProgress>,
     pub inliers: u32,
     pub focal_px: Option<f64>,
-    pub best_score: Option<f64>,
+    pub best_cost: Option<f64>,
 }
 
 /// Wraps the caller's observer for one solve.
@@ -210,7 +210,7 @@ impl<'a> Recorder<'a> {
     /// Tells how many verdicts there are; `tracks`: how many are judged.
     pub fn judged(&mut self, verdicts: usize, tracks: usize) {
         let most = JUDGED_TIMES * tracks;
-        self.step(Task::Judge, verdicts, most, verdicts as f64 / most.max(1) as f64);
+        self.step(Task::Classify, verdicts, most, verdicts as f64 / most.max(1) as f64);
     }
 
     /// Reports the current state to the observer if it got nothing for a while.
@@ -237,7 +237,7 @@ impl<'a> Recorder<'a> {
             head: self.hypothesis.head,
             inliers: self.hypothesis.inliers,
             focal_px: self.hypothesis.focal_px,
-            best_score: self.hypothesis.best_score,
+            best_cost: self.hypothesis.best_cost,
             elapsed_seconds: self.seconds(),
             reconstruction: self.reconstruction,
         }

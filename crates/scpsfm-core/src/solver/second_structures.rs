@@ -124,7 +124,7 @@ pub fn mark(problem: &Problem, second: &[bool], tracks: &mut TrackResults) -> Op
     if second < LEAST_INLIERS {
         return None;
     }
-    tracks.second_structure = marked;
+    tracks.second_structure = marked.into_iter().map(u32::from).collect();
     let detail = format!(
         "{second} tracks that are left out agree on another rigid motion: a second moving body, or a repeated \
          structure; the result is of {first} other tracks, not of both"

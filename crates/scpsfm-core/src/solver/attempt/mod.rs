@@ -310,7 +310,7 @@ fn search(
     }
     let (mut refined, ln_false_alarms) = grow::refine(complete, &consensus, portfolio::spread(complete), problem.stop);
     recorder.hypothesis.inliers = refined.inlier_count() as u32;
-    recorder.hypothesis.best_score = Some(refined.score);
+    recorder.hypothesis.best_cost = Some(refined.score);
     recorder.report(1.0);
     let counted = match &attempt.found.track_scores {
         Some(track_scores) => track_scores.counted(&refined.inliers()),

@@ -267,7 +267,7 @@ impl<'a> Portfolio<'a> {
     fn stand(&self, recorder: &mut Recorder) {
         if let Some(best) = &self.best {
             recorder.hypothesis.inliers = best.consensus.inlier_count() as u32;
-            recorder.hypothesis.best_score = Some(best.consensus.score);
+            recorder.hypothesis.best_cost = Some(best.consensus.score);
         }
     }
 

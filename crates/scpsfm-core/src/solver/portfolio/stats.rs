@@ -52,7 +52,7 @@ impl ProposalStats {
         ProposalTime {
             proposal: self.proposal,
             seconds: sufficient.map(|record| record.seconds),
-            iterations: sufficient.map_or(self.work, |record| record.work),
+            steps: sufficient.map_or(self.work, |record| record.work),
         }
     }
 }

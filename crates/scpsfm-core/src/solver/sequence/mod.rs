@@ -430,7 +430,7 @@ fn finished(problem: &Problem, mut attempt: Attempt, recorder: &mut Recorder) ->
         return Ok(Ended::Block(Some(Box::new(attempt))));
     }
     if let Some(found) = Reconstruction::of_attempt(problem, &attempt).filter(|_| is_done) {
-        recorder.enter(Stage::Judge);
+        recorder.enter(Stage::Classify);
         let judged = found.judged(problem, &attempt, recorder);
         let retained: usize = attempt.block.tracks.iter().map(|&track| judged.retained[track].len()).sum();
         let known = attempt.projective.as_ref().map_or(0, |found| found.observations.len());

@@ -51,7 +51,7 @@ fn assert_folded(raw: &RawInput, duplicated: &[u32], settings: &SolveSettings) {
     let both = solved(&input, settings);
     assert!(duplicates(&both).is_some());
     assert_eq!((&both.calibrations, both.grade, &both.views), (&alone.calibrations, alone.grade, &alone.views));
-    assert_eq!(both.input_sha256, Some(input.to_raw().sha256()));
+    assert_eq!(both.input_content_sha256, Some(input.to_raw().sha256()));
     let (tracks, observations) = (raw.track_count, raw.x.len());
     let mut more = observations;
     for (n, &track) in duplicated.iter().enumerate() {

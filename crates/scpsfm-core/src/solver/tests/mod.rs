@@ -374,7 +374,7 @@ fn a_stop_ends_the_solve_wherever_it_is() {
         let outcome = solve(&input, &SolveSettings::default(), &mut observer, &token);
         let error = outcome.map(|solution| solution.status);
         assert_eq!(error, Err(Error::Stopped(StopReason::Cancelled)), "{outliers}: stopped after {reports} reports");
-        assert!(!observer.seen.contains(&Stage::Judge));
+        assert!(!observer.seen.contains(&Stage::Classify));
     }
 }
 

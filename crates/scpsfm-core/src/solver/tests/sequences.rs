@@ -246,6 +246,8 @@ fn camera_groups_have_focal_lengths_of_their_own_however_small_they_are() {
     let solution = solved(&grouped(&|view| if view < 10 { 3 } else { 7 }), &SolveSettings::default());
     assert_eq!(solution.registered_views().len(), 16, "{:?}", solution.warnings);
     assert_eq!(solution.grade, Some(Grade::Metric), "{:?}", solution.warnings);
+    assert_eq!(solution.cameras().iter().map(|(group, _)| *group).collect::<Vec<u32>>(), [3, 7]);
+    assert!(solution.cameras().iter().all(|(_, calibration)| calibration.is_some()));
     let focals: Vec<f64> = solution.calibrations.iter().map(|calibration| calibration.focal_px).collect();
     let expected = [sequence.truth.focal_px, 0.8 * sequence.truth.focal_px];
     assert!(focals.iter().zip(expected).all(|(found, true_px)| (found / true_px - 1.0).abs() < 0.02), "{focals:?}");
