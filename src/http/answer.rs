@@ -135,7 +135,8 @@ pub fn status_of(refusal: HttpRefusal, text: impl Into<String>) -> Status {
     status::refused(code, refusal.reason(), text)
 }
 
-fn refused(code: StatusCode, status: &Status) -> Answer {
+/// A refusal with a code of HTTP that gRPC has no word for.
+pub fn refused(code: StatusCode, status: &Status) -> Answer {
     let mut answer = (code, axum::Json(error_body(status, code))).into_response();
     let headers = answer.headers_mut();
     if status.code() == Code::Unauthenticated {
@@ -150,7 +151,7 @@ fn refused(code: StatusCode, status: &Status) -> Answer {
 }
 
 /// Answers are data: no page runs or embeds them, and none is guessed to be another kind.
-fn secured(mut answer: Answer) -> Answer {
+pub fn secured(mut answer: Answer) -> Answer {
     let headers = answer.headers_mut();
     headers.insert(header::X_CONTENT_TYPE_OPTIONS, HeaderValue::from_static("nosniff"));
     headers.insert(header::CONTENT_SECURITY_POLICY, HeaderValue::from_static("default-src 'none'"));

@@ -22,7 +22,7 @@ use super::codec::Encoded;
 use super::origin::{self, Origin};
 use super::route::{self, Found, Route};
 use super::unique_keys::UniqueKeys;
-use super::{Options, console, grpc_web, openapi, upload};
+use super::{Options, console, download, grpc_web, openapi, upload};
 use crate::domain::Violation;
 use crate::domain::error::quoted;
 use crate::domain::job::JobState;
@@ -146,6 +146,11 @@ impl Api {
                 return upload::answer(self, connection_info, parent, request).await;
             }
             allowed.push(Method::POST);
+        }
+        if verb == Method::GET
+            && let Some(name) = download::job(&path, request.headers())
+        {
+            return download::answer(self, connection_info, name, request.headers()).await;
         }
         match route::find(&self.routes, &verb, &path) {
             Found::Route(route, fields) => return self.call(route, fields, connection_info, request).await,
@@ -348,9 +353,14 @@ pub(super) fn call<T>(
     call
 }
 
-/// The media type of a body in lowercase, without parameters (RFC 9110, section 8.3.1).
+/// The media type of a body (RFC 9110, section 8.3.1).
 pub(super) fn media_type(headers: &HeaderMap) -> String {
     let kind = headers.get(header::CONTENT_TYPE).and_then(|kind| kind.to_str().ok()).unwrap_or_default();
+    essence(kind)
+}
+
+/// A media type in lowercase, without parameters.
+pub(super) fn essence(kind: &str) -> String {
     kind.split(';').next().unwrap_or_default().trim().to_ascii_lowercase()
 }
 

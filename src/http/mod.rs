@@ -16,6 +16,7 @@ mod answer;
 mod api;
 mod codec;
 mod console;
+mod download;
 mod grpc_web;
 mod openapi;
 mod origin;

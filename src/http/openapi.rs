@@ -7,6 +7,7 @@ use prost_reflect::{Cardinality, EnumDescriptor, FieldDescriptor, FileDescriptor
 use serde_json::{Map, Value, json};
 
 use super::route::Route;
+use super::upload::PROTOBUF;
 
 /// Annotation of fields (AIP-203), and its values that the description tells.
 const BEHAVIOR: &str = "google.api.field_behavior";
@@ -96,7 +97,12 @@ fn answer_of(is_stream: bool, output: &MessageDescriptor, schemas: &mut Schemas)
             "content": {"text/event-stream": {"schema": schema}},
         });
     }
-    json!({"description": "The answer.", "content": {"application/json": {"schema": schema}}})
+    let mut content = json!({"application/json": {"schema": schema}});
+    if output.name() == "JobResult" {
+        // See `download`.
+        content[PROTOBUF] = json!({"schema": {"type": "string", "format": "binary"}});
+    }
+    json!({"description": "The answer.", "content": content})
 }
 
 fn upload(data: &MessageDescriptor, input: &MessageDescriptor, schemas: &mut Schemas) -> Value {
@@ -113,7 +119,7 @@ fn upload(data: &MessageDescriptor, input: &MessageDescriptor, schemas: &mut Sch
         "requestBody": {"required": true, "content": {
             "application/json": {"schema": data},
             // Generators leave a call out that has a body without a schema.
-            "application/x-protobuf": {"schema": {"type": "string", "format": "binary"}},
+            (PROTOBUF): {"schema": {"type": "string", "format": "binary"}},
         }},
         "responses": {
             "200": {"description": "The input.", "content": {"application/json": {"schema": input}}},

@@ -22,7 +22,7 @@ use crate::rpc::proto::{self, UploadInputRequest};
 use crate::telemetry::metrics::HttpRefusal;
 
 /// The media type of protobuf.
-const PROTOBUF: &str = "application/x-protobuf";
+pub const PROTOBUF: &str = "application/x-protobuf";
 
 /// Parameter of the query that names the upload.
 const UPLOAD_ID: &str = "uploadId";

@@ -145,7 +145,8 @@ pub fn job_not_found(name: &JobName) -> Status {
 /// A result that does not fit one message.
 pub fn result_too_large(name: &JobName, bytes: u64, largest: u64) -> Status {
     let message = format!(
-        "the result of {name} has {bytes} bytes, a message at most {largest}: read it by JobService.ReadJobResult"
+        "the result of {name} has {bytes} bytes, a message at most {largest}: read it by JobService.ReadJobResult, over \
+         HTTP with the header accept: application/x-protobuf"
     );
     let metadata = HashMap::from([("bytes".to_owned(), bytes.to_string()), ("max".to_owned(), largest.to_string())]);
     status_with(Code::FailedPrecondition, "RESULT_TOO_LARGE", metadata, message, ErrorDetails::new())

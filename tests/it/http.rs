@@ -3,6 +3,7 @@
 use std::collections::BTreeSet;
 use std::io::{Read, Write};
 use std::net::TcpStream;
+use std::process::Stdio;
 
 use prost::Message as _;
 use scpsfm::rpc::proto;
@@ -433,6 +434,47 @@ fn an_input_is_uploaded_as_json_or_protobuf_and_solved() {
         assert!(events.contains("JOB_STATE_SUCCEEDED"), "{events}");
         assert_eq!(request(&server, "DELETE", &path_of(&input), &[], &[]).code, 200);
     }
+}
+
+#[test]
+fn a_result_of_any_size_is_read_as_protobuf_and_goes_on_where_it_broke_off() {
+    let data = tempfile::tempdir().expect("a temporary directory");
+    let server = Serving::start_with(data.path(), &[("SCPSFM_SERVER__MAX_MESSAGE_BYTES", "1049600")], Stdio::null());
+    // Tracks without observations: a small input with a large result.
+    let mut many = tracks();
+    many["trackCount"] = json!(300_000);
+    let job = post(&server, "/v1/tenants/-/jobs", &json!({"trackSet": many})).json();
+    get(&server, &format!("{}/events", path_of(&job)));
+    let path = format!("{}/result", path_of(&job));
+    assert_eq!(get(&server, &path).refusal().0, "RESULT_TOO_LARGE");
+    let protobuf = ("accept", "application/json;q=0.5, Application/X-Protobuf");
+    let read = |verb: &str, more: &[(&str, &str)]| request(&server, verb, &path, &[&[protobuf], more].concat(), &[]);
+    let whole = read("GET", &[]);
+    assert_eq!((whole.code, whole.header("content-type").as_str()), (200, "application/x-protobuf"));
+    assert!(whole.body.len() > 1 << 20, "{} bytes", whole.body.len());
+    assert_eq!(whole.header("content-length"), whole.body.len().to_string());
+    let result = proto::JobResult::decode(whole.body.as_slice()).expect("a JobResult");
+    assert_eq!(
+        (result.job.as_str(), result.tracks.expect("tracks").weights.len()),
+        (&path[4..path.len() - 7], 300_000)
+    );
+    // From the middle; under a condition, or of several ranges, as a whole; from the end nothing.
+    let rest = read("GET", &[("range", "bytes=300001-")]);
+    assert_eq!((rest.code, rest.header("etag")), (206, whole.header("etag")));
+    let length = whole.body.len();
+    assert_eq!(rest.header("content-range"), format!("bytes 300001-{}/{length}", length - 1));
+    assert!(rest.body == whole.body[300_001..]);
+    assert_eq!(read("GET", &[("range", "bytes=300001-"), ("if-range", &whole.header("etag"))]).code, 200);
+    assert_eq!(read("GET", &[("range", "bytes=0-99,200-")]).code, 200);
+    let nothing = read("GET", &[("range", &format!("bytes={length}-"))]);
+    assert_eq!((nothing.code, nothing.refusal().0.as_str()), (416, "RANGE_NOT_SATISFIABLE"));
+    assert_eq!(nothing.header("content-range"), format!("bytes */{length}"));
+    let beyond = read("GET", &[("range", &format!("bytes={}-", length + 1))]);
+    assert_eq!((beyond.code, beyond.refusal().1.as_str()), (400, "offset"));
+    let head = read("HEAD", &[]);
+    assert_eq!((head.code, head.body.len(), head.header("content-length")), (200, 0, whole.header("content-length")));
+    let none = request(&server, "GET", "/v1/tenants/-/jobs/none/result", &[protobuf], &[]);
+    assert_eq!((none.code, none.refusal().0.as_str()), (404, "JOB_NOT_FOUND"));
 }
 
 #[test]

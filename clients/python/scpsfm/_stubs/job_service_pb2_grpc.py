@@ -212,8 +212,8 @@ class JobServiceServicer(object):
 
     def GetJobResult(self, request, context):
         """The result of a job, in one message. FAILED_PRECONDITION while there is none, and (reason RESULT_TOO_LARGE) for one
-        that is larger than InputLimits.max_message_bytes: read that by ReadJobResult. RESOURCE_EXHAUSTED (reason MEMORY)
-        as CreateJob.
+        that is larger than InputLimits.max_message_bytes: read that by ReadJobResult, over HTTP with the header
+        `accept: application/x-protobuf`. RESOURCE_EXHAUSTED (reason MEMORY) as CreateJob.
         """
         context.set_code(grpc.StatusCode.UNIMPLEMENTED)
         context.set_details('Method not implemented!')
