@@ -9,6 +9,7 @@ mod chaos;
 mod chart;
 mod cli;
 mod colmap;
+mod contract;
 mod crash;
 mod dashboards;
 mod disk;

@@ -91,4 +91,4 @@ def test_wheel_and_sdist_have_stubs_and_types_and_the_wheel_works(tmp_path: Path
         env={"PYTHONPATH": str(tmp_path / "wheel"), "PATH": ""},
         cwd=tmp_path,
     ).stdout
-    assert output.split() == [str(tmp_path / "wheel" / "scpsfm" / "__init__.py"), "0.1.0"]
+    assert output.split() == [str(tmp_path / "wheel" / "scpsfm" / "__init__.py"), "0.2.0"]

@@ -93,7 +93,8 @@ pub struct SolveSettings {
     pub weights_every: u32,
     /// Backend of the network; `None` takes the server's.
     pub backend: Option<Backend>,
-    /// Priors that AUTO and GEOMETRY leave out: for ablations, not for callers.
+    /// Proposals that AUTO and GEOMETRY leave out: for ablations, not for callers, who are not shown it.
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
     pub excluded_proposals: Vec<Proposal>,
 }
 

@@ -1,0 +1,114 @@
+//! The names that programs outside rely on: of the files of a result, of what commands print for programs and of the
+//! paths of the HTTP API. `contract.txt` lists them; messages and fields are held by `proto/released.binpb`.
+
+use std::collections::BTreeSet;
+use std::fs;
+use std::path::Path;
+
+use serde_json::Value;
+
+use crate::http::get;
+use crate::support::program::{Serving, run};
+
+/// How far a job was when it was asked for: what is in it depends on the moment.
+const PROGRESS: &str = "progress";
+
+/// Names by where they are, one line each.
+#[derive(Default)]
+struct Names(BTreeSet<String>);
+
+impl Names {
+    fn add(&mut self, place: &str, name: &str) {
+        self.0.insert(format!("{place}: {name}"));
+    }
+
+    /// The keys of an object and of all that it holds, but for [`PROGRESS`].
+    fn add_keys(&mut self, place: &str, path: &str, value: &Value) {
+        match value {
+            Value::Object(fields) => {
+                for (key, value) in fields {
+                    let path = format!("{path}{key}");
+                    self.add(place, &path);
+                    if key != PROGRESS {
+                        self.add_keys(place, &format!("{path}."), value);
+                    }
+                }
+            }
+            Value::Array(values) => values.iter().for_each(|value| self.add_keys(place, path, value)),
+            _ => {}
+        }
+    }
+
+    /// The names in the files of a directory: keys, columns and properties.
+    fn add_files(&mut self, directory: &Path) {
+        for entry in fs::read_dir(directory).expect("a directory") {
+            let path = entry.expect("an entry").path();
+            let name = path.file_name().and_then(|name| name.to_str()).expect("a name").to_owned();
+            let text = || fs::read_to_string(&path).expect("text");
+            match path.extension().and_then(|extension| extension.to_str()) {
+                Some("json") => self.add_keys(&name, "", &serde_json::from_str(&text()).expect("JSON")),
+                Some("csv") => {
+                    text().lines().next().expect("a header").split(',').for_each(|column| self.add(&name, column));
+                }
+                Some("ply") => {
+                    let text = text();
+                    let header = text.lines().take_while(|line| *line != "end_header");
+                    header.filter(|line| line.starts_with("property")).for_each(|line| self.add(&name, line));
+                }
+                _ => self.add(&name, "the file"),
+            }
+        }
+    }
+}
+
+/// Runs the program; returns what it printed. Ending without a reconstruction is as good as any.
+fn printed(arguments: &[&str]) -> String {
+    let ran = run(arguments);
+    assert!(matches!(ran.code, Some(0 | 3)), "{arguments:?}: {ran:?}");
+    ran.stdout
+}
+
+#[test]
+fn no_released_name_is_gone_and_every_new_one_is_listed() {
+    let directory = tempfile::tempdir().expect("a temporary directory");
+    let path = |name: &str| directory.path().join(name).to_str().expect("a path of ours").to_owned();
+    let mut names = Names::default();
+    let size = ["--width", "1000", "--height", "1000"];
+    let mut solved = |scene: &[&str], settings: &[&str], out: &str| {
+        let input = path(&format!("{out}-input"));
+        printed(&[&["synth", "--out", &input], scene].concat());
+        let input = format!("{input}/observations.csv");
+        printed(&[&["solve", &input, "--quiet", "--out", &path(out)], &size[..], settings].concat());
+        names.add_files(Path::new(&path(out)));
+        input
+    };
+    // A second motion, whose tracks are marked; nothing but wrong tracks; windows of a walk.
+    let input = solved(&["--outliers", "0.5", "--second-motion", "0.3", "--seed", "1"], &[], "metric");
+    solved(&["--outliers", "1", "--tracks", "60"], &[], "nothing");
+    let walk = ["--sequence", "--views", "8", "--tracks", "200"];
+    solved(&walk, &["--window", "4"], "windows");
+
+    let server = Serving::start(&directory.path().join("data"));
+    let at = ["--server", &server.grpc];
+    // Long enough to tell of its progress.
+    let long = ["--method", "paper", "--iterations", "1000"];
+    let job = printed(&[&["submit", &input], &size[..], &long, &at].concat());
+    let job = job.trim();
+    let commands = [&["watch", job][..], &["get", job], &["list"], &["admin", "queue"]];
+    for command in commands {
+        let place = format!("{} --json", command.join(" ").replace(job, "JOB"));
+        let answer = printed(&[command, &["--json"], &at].concat());
+        let values = serde_json::Deserializer::from_str(&answer).into_iter::<Value>();
+        values.for_each(|value| names.add_keys(&place, "", &value.expect("JSON")));
+    }
+    for (path, methods) in get(&server, "/openapi.json").json()["paths"].as_object().expect("paths") {
+        methods.as_object().expect("methods").keys().for_each(|method| names.add(method, path));
+    }
+
+    let listed = include_str!("contract.txt").lines().filter(|line| !line.starts_with('#'));
+    let listed: BTreeSet<String> = listed.map(str::to_owned).collect();
+    let gone: Vec<&String> = listed.difference(&names.0).collect();
+    let new: Vec<&String> = names.0.difference(&listed).collect();
+    assert!(gone.is_empty(), "names that programs rely on are gone: {gone:#?}");
+    assert!(new.is_empty(), "new names, to be listed in tests/it/contract.txt: {new:#?}");
+}
