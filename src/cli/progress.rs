@@ -163,8 +163,8 @@ fn describe(progress: &Progress) -> String {
     if let Some(focal_px) = progress.focal_px {
         text.push_str(&format!(", focal {focal_px:.1} px"));
     }
-    if let Some(score) = progress.best_cost {
-        text.push_str(&format!(", score {score:.4}"));
+    if let Some(cost) = progress.best_cost {
+        text.push_str(&format!(", cost {cost:.4}"));
     }
     if let Some(losses) = progress.losses {
         text.push_str(&format!(
@@ -270,7 +270,7 @@ mod tests {
         progress.losses = Some(Losses { num: 1e-4, proj: 0.5, daq: 2.0 });
         assert_eq!(
             describe(&progress),
-            "19 inliers, focal 1204.3 px, score 0.2500, iteration 120, L_num 1.00e-4 L_proj 0.500 L_DAQ 2.000, 1.2 s"
+            "19 inliers, focal 1204.3 px, cost 0.2500, iteration 120, L_num 1.00e-4 L_proj 0.500 L_DAQ 2.000, 1.2 s"
         );
     }
 

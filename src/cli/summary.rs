@@ -15,12 +15,13 @@ const MOST_PARTS: usize = 10;
 pub fn text(solution: &Solution, input: Option<&LabelledInput>) -> String {
     let mut lines = vec![headline(solution)];
     let mut fact = |name: &str, value: String| lines.push(format!("  {name:<13}{value}"));
-    match solution.calibrations.as_slice() {
-        [] if solution.is_focal_unobservable() => fact("focal", "unobservable: none is given".into()),
-        [] => {}
-        [only] => fact("focal", focal(only.focal_px, only.sigma_log_focal)),
-        several => {
-            for camera in camera_groups(solution).iter().take(MOST_CAMERAS) {
+    let groups = camera_groups(solution);
+    match (solution.calibrations.first(), groups.as_slice()) {
+        (None, _) if solution.is_focal_unobservable() => fact("focal", "unobservable: none is given".into()),
+        (None, _) => {}
+        (Some(only), [_]) => fact("focal", focal(only.focal_px, only.sigma_log_focal)),
+        (Some(_), several) => {
+            for camera in several.iter().take(MOST_CAMERAS) {
                 fact(&format!("camera {}", camera.camera_group), self::camera(camera));
             }
             if several.len() > MOST_CAMERAS {
@@ -41,9 +42,9 @@ pub fn text(solution: &Solution, input: Option<&LabelledInput>) -> String {
             solution.inlier_observation_count()
         ),
     );
-    match input.map_or(0, |input| unjudged(solution, input)) {
+    match input.map_or(0, |input| unclassified(solution, input)) {
         0 => {}
-        count => fact("not judged", format!("{count} tracks: fewer than {VERIFIED} registered views see them")),
+        count => fact("unclassified", format!("{count} tracks: fewer than {VERIFIED} registered views see them")),
     }
     if !solution.splits.is_empty() {
         fact("splits", format!("{} further points in tracks that join several", solution.splits.len()));
@@ -73,7 +74,7 @@ pub fn text(solution: &Solution, input: Option<&LabelledInput>) -> String {
 }
 
 /// Tracks that nothing is said of, as too few registered views see them; of a method that judges observations.
-fn unjudged(solution: &Solution, input: &LabelledInput) -> usize {
+fn unclassified(solution: &Solution, input: &LabelledInput) -> usize {
     if solution.status != Status::Solved || !matches!(solution.method, Method::Auto | Method::Geometry) {
         return 0;
     }
@@ -167,10 +168,10 @@ mod tests {
     #[test]
     fn tells_how_many_tracks_nothing_is_said_of() {
         let (input, mut solution) = fixture::solved();
-        assert!(!text(&solution, Some(&input)).contains("not judged"), "{}", text(&solution, Some(&input)));
+        assert!(!text(&solution, Some(&input)).contains("unclassified"), "{}", text(&solution, Some(&input)));
         solution.views[..3].iter_mut().for_each(|view| view.projection = None);
         let lines = text(&solution, Some(&input));
-        assert!(lines.contains("not judged   40 tracks: fewer than 3 registered views see them"), "{lines}");
+        assert!(lines.contains("unclassified 40 tracks: fewer than 3 registered views see them"), "{lines}");
     }
 
     #[test]
@@ -200,6 +201,7 @@ mod tests {
         assert!(lines.contains("  camera 0     ") && lines.contains("4 of 4 views, METRIC"), "{lines}");
         assert!(lines.contains("  camera 9     77.0 px +- 0.40 % (one sigma), 1 of 1 views, WEAK"), "{lines}");
         solution.views[4].projection = None;
+        solution.calibrations.pop();
         assert!(text(&solution, None).contains("camera 9     no calibration, 0 of 1 views"));
     }
 

@@ -179,8 +179,7 @@ impl Failure {
 pub struct PastAttempt {
     /// Counted from 1.
     pub attempt: u32,
-    /// The process that made it. Stores of before 0.2.0 have it under the other name.
-    #[serde(alias = "worker")]
+    /// The server process that made it.
     pub server: String,
     pub start_time: SystemTime,
     /// When it ended; of a lost one, when that was found.
@@ -194,9 +193,9 @@ pub struct PastAttempt {
 pub enum AttemptEnd {
     /// It ended its job.
     Ended,
-    /// Its worker gave the job back, as at a drain.
+    /// Its server gave the job back, as at a drain.
     GivenBack,
-    /// Its worker was not heard of for the time of a lease, or its process died.
+    /// Its server was not heard of for the time of a lease, or its process died.
     Lost,
 }
 

@@ -194,7 +194,7 @@ fn solve(
 }
 
 fn summarise(solution: &Solution, result_size_bytes: u64) -> Summary {
-    let calibration = solution.first_calibration();
+    let calibration = solution.calibrations.first();
     let count = |number: usize| u32::try_from(number).unwrap_or(u32::MAX);
     Summary {
         status: solution.status,

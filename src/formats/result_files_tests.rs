@@ -248,8 +248,9 @@ fn several_camera_groups_are_listed_and_each_view_gets_its_own() {
             assert_eq!((&of[field], &of[&error]), (&value.into(), &sigma.into()), "{field}");
         }
     }
-    // The first group that has registered views is the summary's own.
+    // The first group with registered views is the summary's own.
     solution.views.iter_mut().filter(|view| view.camera_group == 0).for_each(|view| view.projection = None);
+    solution.calibrations.remove(0);
     let summary = json(&solution);
     for field in keys(&found[1]).into_iter().filter(|field| field.contains("radial") || field.contains("tangential")) {
         assert_eq!(summary[field], found[1][field], "{field}");

@@ -17,7 +17,7 @@ use super::{Label, LabelledInput, warnings};
 pub struct ResultJson {
     pub status: Status,
     pub grade: Option<Grade>,
-    /// Of the first camera group that has registered views, down to `sigma_tangential_p2`; see `cameras` where there
+    /// Of the first camera group with registered views, down to `sigma_tangential_p2`; see `cameras` where there
     /// are several.
     pub focal_px: Option<f64>,
     pub sigma_log_focal: Option<f64>,
@@ -123,7 +123,6 @@ pub fn camera_groups(solution: &Solution) -> Vec<CameraGroupJson> {
     let entry = |(camera_group, calibration): (u32, Option<&Calibration>)| {
         let views = || solution.views.iter().filter(move |view| view.camera_group == camera_group);
         let registered_views = views().filter(|view| view.projection.is_some()).count();
-        let calibration = calibration.filter(|_| registered_views > 0);
         let mut codes: Vec<WarningCode> = Vec::new();
         for warning in solution.warnings.iter().filter(|warning| warning.camera_group == Some(camera_group)) {
             if !codes.contains(&warning.code) {

@@ -99,7 +99,7 @@ impl Row {
 
     /// The same with its solution.
     pub fn solved(index: usize, input: &LabelledInput, solution: &Solution) -> Self {
-        let calibration = solution.first_calibration();
+        let calibration = solution.calibrations.first();
         let why = warnings::reason(solution);
         let why = why.map_or_else(String::new, |warning| format!("{}: {}", warning.code.name(), warning.detail));
         Self {

@@ -135,7 +135,7 @@ pub fn status_of(refusal: HttpRefusal, text: impl Into<String>) -> Status {
     status::refused(code, refusal.reason(), text)
 }
 
-/// A refusal with a code of HTTP that gRPC has no word for.
+/// A refusal with this code of HTTP.
 pub fn refused(code: StatusCode, status: &Status) -> Answer {
     let mut answer = (code, axum::Json(error_body(status, code))).into_response();
     let headers = answer.headers_mut();

@@ -147,12 +147,12 @@ impl Api {
             }
             allowed.push(Method::POST);
         }
-        if verb == Method::GET
-            && let Some(name) = download::job(&path, request.headers())
-        {
-            return download::answer(self, connection_info, name, request.headers()).await;
-        }
         match route::find(&self.routes, &verb, &path) {
+            Found::Route(route, fields) if download::is_of(route) && download::is_accepted(request.headers()) => {
+                let (head, _) = request.into_parts();
+                let name = fields.into_iter().map(|(_, name)| name).next().unwrap_or_default();
+                return download::answer(self, connection_info, name, &head).await;
+            }
             Found::Route(route, fields) => return self.call(route, fields, connection_info, request).await,
             Found::OtherVerbs(verbs) => allowed.extend(verbs),
             Found::Nothing => {}

@@ -6,6 +6,7 @@ use std::collections::BTreeSet;
 use prost_reflect::{Cardinality, EnumDescriptor, FieldDescriptor, FileDescriptor, Kind, MessageDescriptor};
 use serde_json::{Map, Value, json};
 
+use super::download;
 use super::route::Route;
 use super::upload::PROTOBUF;
 
@@ -77,7 +78,7 @@ fn operation(route: &Route, path_parameters: &[String], schemas: &mut Schemas) -
         "description": description,
         "parameters": parameters,
         "responses": {
-            "200": answer_of(method.is_server_streaming(), &method.output(), schemas),
+            "200": answer_of(route, schemas),
             "default": refusal(),
         },
     });
@@ -88,9 +89,9 @@ fn operation(route: &Route, path_parameters: &[String], schemas: &mut Schemas) -
     operation
 }
 
-fn answer_of(is_stream: bool, output: &MessageDescriptor, schemas: &mut Schemas) -> Value {
-    let schema = schemas.reference(output);
-    if is_stream {
+fn answer_of(route: &Route, schemas: &mut Schemas) -> Value {
+    let schema = schemas.reference(&route.method.output());
+    if route.method.is_server_streaming() {
         // OpenAPI 3.1 has no word for a stream of events: the schema is that of each event's data.
         return json!({
             "description": "Server-sent events; each one's data is such a message, its id the number to go on after.",
@@ -98,8 +99,7 @@ fn answer_of(is_stream: bool, output: &MessageDescriptor, schemas: &mut Schemas)
         });
     }
     let mut content = json!({"application/json": {"schema": schema}});
-    if output.name() == "JobResult" {
-        // See `download`.
+    if download::is_of(route) {
         content[PROTOBUF] = json!({"schema": {"type": "string", "format": "binary"}});
     }
     json!({"description": "The answer.", "content": content})

@@ -8,11 +8,12 @@ use axum::response::IntoResponse;
 use super::answer::Answer;
 use super::route::Route;
 
-/// What such a page may send: JSON, a key, and what clients of gRPC-Web add.
-const REQUEST_HEADERS: &str = "authorization, content-type, grpc-timeout, last-event-id, traceparent, tracestate, \
-                               x-grpc-web, x-user-agent";
-/// What it may read: how a call of gRPC ended, and when to come back.
-const ANSWER_HEADERS: &str = "grpc-message, grpc-status, grpc-status-details-bin, retry-after";
+/// What such a page may send: JSON, a key, where a result goes on, and what clients of gRPC-Web add.
+const REQUEST_HEADERS: &str = "authorization, content-type, grpc-timeout, if-range, last-event-id, range, traceparent, \
+                               tracestate, x-grpc-web, x-user-agent";
+/// What it may read: how a call of gRPC ended, which part of which result came, and when to come back.
+const ANSWER_HEADERS: &str = "accept-ranges, content-range, etag, grpc-message, grpc-status, grpc-status-details-bin, \
+                              retry-after";
 /// Seconds that a browser remembers the permission: Chromium remembers none for longer.
 const REMEMBERED_SECONDS: &str = "7200";
 

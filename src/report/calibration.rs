@@ -236,6 +236,7 @@ mod tests {
         assert_eq!(html.matches("<circle").count(), 2);
         solution.views[2].projection = None;
         solution.views[3].projection = None;
+        solution.calibrations.pop();
         let html = section(&solution);
         assert!(html.contains("<tr><td>9</td><td>0 of 3</td><td>none</td>"), "{html}");
         assert_eq!(html.matches("<circle").count(), 1, "a camera without registered views has no focal length");

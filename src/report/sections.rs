@@ -29,12 +29,12 @@ pub fn headline(solution: &Solution) -> String {
         let _ =
             writeln!(html, "<div><dt>{}</dt><dd>{}</dd><p>{}</p></div>", escape(name), escape(&figure), escape(&note));
     };
-    if let Some(calibration) = solution.first_calibration() {
+    if let Some(calibration) = solution.calibrations.first() {
         let note = match calibration.sigma_log_focal {
             Some(sigma) => format!("\u{b1} {} % (one sigma)", short(sigma * 100.0)),
             None => "unobservable".into(),
         };
-        let note = match solution.calibrations.len() {
+        let note = match solution.cameras().len() {
             1 => note,
             several => format!("{note}; the first of {several} cameras, see Calibration"),
         };
@@ -160,7 +160,7 @@ pub fn convergence(solution: &Solution) -> String {
         clip,
         marks: stage_starts(history),
     };
-    let clip = solution.first_calibration().map(|camera| (camera.focal_px / FOCAL_CLIP, camera.focal_px * FOCAL_CLIP));
+    let clip = solution.calibrations.first().map(|camera| (camera.focal_px / FOCAL_CLIP, camera.focal_px * FOCAL_CLIP));
     let charts = [
         losses,
         single("Inliers of the best hypothesis", over_steps(|record| Some(f64::from(record.inliers))), None),

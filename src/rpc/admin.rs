@@ -55,10 +55,10 @@ impl proto::admin_service_server::AdminService for Admin {
         &self,
         request: Request<proto::DrainServerRequest>,
     ) -> Result<Response<proto::DrainServerResponse>, Status> {
-        let worker = &self.engine.options().worker_name;
-        Caller::of(&request)?.audit("DrainServer", worker, &Ok(()));
+        let server = self.engine.options().worker_name.clone();
+        Caller::of(&request)?.audit("DrainServer", &server, &Ok(()));
         self.engine.ask_for_drain();
-        Ok(Response::new(proto::DrainServerResponse { server: self.engine.options().worker_name.clone() }))
+        Ok(Response::new(proto::DrainServerResponse { server }))
     }
 }
 

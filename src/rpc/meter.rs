@@ -320,6 +320,7 @@ mod tests {
 
     use metrics_exporter_prometheus::PrometheusBuilder;
     use prost::Message;
+    use prost_types::method_options::IdempotencyLevel;
     use tonic::codegen::http::{HeaderMap, HeaderValue};
 
     use super::*;
@@ -397,6 +398,8 @@ mod tests {
                     assert_eq!(method_of(&format!("/{name}")), name);
                     // Methods whose names begin with these words change nothing.
                     let reads = ["Get", "List", "Watch", "Read"].iter().any(|verb| method.name().starts_with(verb));
+                    let level = method.options.as_ref().map_or_else(Default::default, |of| of.idempotency_level());
+                    assert_eq!(level == IdempotencyLevel::NoSideEffects, reads, "{name}");
                     let expected = match (service.name(), reads) {
                         ("AdminService", _) => Scope::Admin,
                         (_, true) => Scope::ReadOnly,

@@ -77,6 +77,8 @@ def test_a_job_is_seen_from_queued_to_its_result(
     assert f"{summary['inlierTrackCount']}\nof 120" in shown
     browser.sees("Cameras, one row for each camera group")
     browser.sees("960")
+    folded = "return [...document.querySelectorAll('details')].map((of) => of.textContent).join(' ')"
+    assert "Classifying tracks and observations" in str(browser.driver.execute_script(folded))
     until("there are curves of the events", lambda: browser.all("figure:not([hidden]) svg polyline"))
     scene_is_drawn(browser)
     assert browser.errors() == []

@@ -97,7 +97,10 @@ fn values_have_every_key_of_the_configuration_and_no_other() {
 #[test]
 fn the_chart_names_this_version_and_keeps_the_services_variables_out() {
     let read = |path: &str| std::fs::read_to_string(chart().join(path)).expect(path);
-    assert!(read("Chart.yaml").contains(&format!("\nappVersion: \"{}\"\n", env!("CARGO_PKG_VERSION"))));
+    let version = env!("CARGO_PKG_VERSION");
+    assert!(read("Chart.yaml").contains(&format!("\nappVersion: \"{version}\"\n")));
+    assert!(read("../../README.md").contains(&format!("/scpsfm:{version} .")));
+    assert!(read("../../../clients/python/pyproject.toml").contains(&format!("\nversion = \"{version}\"\n")));
     // Kubernetes would set SCPSFM_METRICS_SERVICE_HOST for a service scpsfm-metrics.
     assert!(read("templates/deployment.yaml").contains("\n      enableServiceLinks: false\n"));
     let refused = program(["serve", "--print-config"]).env("SCPSFM_METRICS_SERVICE_HOST", "10.0.0.1").output();

@@ -1,10 +1,12 @@
-//! The names that programs outside rely on: of the files of a result, of what commands print for programs and of the
-//! paths of the HTTP API. `contract.txt` lists them; messages and fields are held by `proto/released.binpb`.
+//! What programs outside rely on: the API as it was released, and the names in the files of a result, in what commands
+//! print with `--json` and of the paths over HTTP, as far as a run shows them.
 
 use std::collections::BTreeSet;
 use std::fs;
 use std::path::Path;
 
+use prost_reflect::{DescriptorPool, EnumDescriptor, FieldDescriptor, MessageDescriptor};
+use scpsfm::rpc::proto;
 use serde_json::Value;
 
 use crate::http::get;
@@ -94,7 +96,8 @@ fn no_released_name_is_gone_and_every_new_one_is_listed() {
     let long = ["--method", "paper", "--iterations", "1000"];
     let job = printed(&[&["submit", &input], &size[..], &long, &at].concat());
     let job = job.trim();
-    let commands = [&["watch", job][..], &["get", job], &["list"], &["admin", "queue"]];
+    printed(&[&["upload", &input], &size[..], &at].concat());
+    let commands = [&["watch", job][..], &["get", job], &["list"], &["inputs"], &["admin", "queue"]];
     for command in commands {
         let place = format!("{} --json", command.join(" ").replace(job, "JOB"));
         let answer = printed(&[command, &["--json"], &at].concat());
@@ -105,10 +108,55 @@ fn no_released_name_is_gone_and_every_new_one_is_listed() {
         methods.as_object().expect("methods").keys().for_each(|method| names.add(method, path));
     }
 
+    let drained = printed(&[&["admin", "drain", "--json"], &at[..]].concat());
+    names.add_keys("admin drain --json", "", &serde_json::from_str(&drained).expect("JSON"));
+
     let listed = include_str!("contract.txt").lines().filter(|line| !line.starts_with('#'));
     let listed: BTreeSet<String> = listed.map(str::to_owned).collect();
     let gone: Vec<&String> = listed.difference(&names.0).collect();
     let new: Vec<&String> = names.0.difference(&listed).collect();
     assert!(gone.is_empty(), "names that programs rely on are gone: {gone:#?}");
     assert!(new.is_empty(), "new names, to be listed in tests/it/contract.txt: {new:#?}");
+}
+
+/// What a description of the API promises, a line each.
+fn promises(pool: &DescriptorPool) -> BTreeSet<String> {
+    let is_ours = |name: &str| name.starts_with("scpsfm.");
+    let field = |of: FieldDescriptor| {
+        let group = of.containing_oneof().map(|group| group.name().to_owned());
+        format!(
+            "{} = {}, {:?} {:?}, {group:?}, {}",
+            of.full_name(),
+            of.number(),
+            of.cardinality(),
+            of.kind(),
+            of.json_name()
+        )
+    };
+    let of_message = |message: MessageDescriptor| message.fields().map(field).collect::<Vec<String>>();
+    let value = |of: EnumDescriptor| {
+        of.values().map(|value| format!("{} = {}", value.full_name(), value.number())).collect::<Vec<String>>()
+    };
+    let fields = pool.all_messages().filter(|message| is_ours(message.full_name())).flat_map(of_message);
+    let values = pool.all_enums().filter(|of| is_ours(of.full_name())).flat_map(value);
+    let methods = pool.services().flat_map(|service| service.methods().collect::<Vec<_>>()).map(|method| {
+        let streams = (method.is_client_streaming(), method.is_server_streaming());
+        format!("{}: {:?} -> {:?}, {streams:?}", method.full_name(), method.input(), method.output())
+    });
+    fields.chain(values).chain(methods).collect()
+}
+
+/// The same as `buf breaking`, which not every machine has, but for what only generated code notices.
+#[test]
+fn the_released_api_is_there_and_is_all_of_it_where_nothing_is_unreleased() {
+    let decoded = |bytes: &[u8]| promises(&DescriptorPool::decode(bytes).expect("a set of files"));
+    let released = decoded(include_bytes!("../../proto/released.binpb"));
+    let now = decoded(proto::FILE_DESCRIPTOR_SET);
+    assert!(released.len() > 300, "{} promises", released.len());
+    let broken: Vec<&String> = released.difference(&now).collect();
+    assert!(broken.is_empty(), "the API breaks what was released: {broken:#?}");
+    let (_, unreleased) = include_str!("../../CHANGELOG.md").split_once("## [Unreleased]").expect("a section");
+    let unreleased = unreleased.split("\n## ").next().unwrap_or_default();
+    let new: Vec<&String> = now.difference(&released).collect();
+    assert!(new.is_empty() || unreleased.contains("API:"), "a release makes released.binpb: {new:#?}");
 }

@@ -146,7 +146,8 @@ fn pages_of_named_origins_may_call_and_no_others() {
     let list = proto::ListJobsRequest { parent: "tenants/-".into(), ..Default::default() };
     let listed = call(&server, "JobService/ListJobs", &list, &[("origin", APP)]);
     assert!(listed.has_status(0) && listed.head.contains("access-control-allow-origin: https://app.example"));
-    assert!(listed.head.contains("access-control-expose-headers: grpc-message, grpc-status"), "{}", listed.head);
+    let exposed = "access-control-expose-headers: accept-ranges, content-range, etag, grpc-message, grpc-status";
+    assert!(listed.head.contains(exposed), "{}", listed.head);
     let kind = [("content-type", "application/grpc-web")];
     let (read, _) = exchange(&server, "GET", path, &kind, &[]);
     assert!(read.starts_with("http/1.1 405") && read.lines().any(|told| told == "allow: post"), "{read}");

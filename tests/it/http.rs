@@ -458,23 +458,35 @@ fn a_result_of_any_size_is_read_as_protobuf_and_goes_on_where_it_broke_off() {
         (result.job.as_str(), result.tracks.expect("tracks").weights.len()),
         (&path[4..path.len() - 7], 300_000)
     );
-    // From the middle; under a condition, or of several ranges, as a whole; from the end nothing.
+    // From the middle, if it is the same result still; other ranges are the whole; from the end on nothing.
     let rest = read("GET", &[("range", "bytes=300001-")]);
     assert_eq!((rest.code, rest.header("etag")), (206, whole.header("etag")));
     let length = whole.body.len();
     assert_eq!(rest.header("content-range"), format!("bytes 300001-{}/{length}", length - 1));
     assert!(rest.body == whole.body[300_001..]);
-    assert_eq!(read("GET", &[("range", "bytes=300001-"), ("if-range", &whole.header("etag"))]).code, 200);
-    assert_eq!(read("GET", &[("range", "bytes=0-99,200-")]).code, 200);
+    let range = ("range", "bytes=300001-");
+    assert_eq!(read("GET", &[range, ("if-range", &whole.header("etag"))]).code, 206);
+    let changed = read("GET", &[range, ("if-range", "\"another\"")]);
+    assert!((changed.code, &changed.body) == (200, &whole.body));
+    for other in ["bytes=0-99,200-", "bytes=-5", "bytes=+5-", "rows=5-"] {
+        assert_eq!(read("GET", &[("range", other)]).code, 200, "{other}");
+    }
     let nothing = read("GET", &[("range", &format!("bytes={length}-"))]);
     assert_eq!((nothing.code, nothing.refusal().0.as_str()), (416, "RANGE_NOT_SATISFIABLE"));
     assert_eq!(nothing.header("content-range"), format!("bytes */{length}"));
     let beyond = read("GET", &[("range", &format!("bytes={}-", length + 1))]);
-    assert_eq!((beyond.code, beyond.refusal().1.as_str()), (400, "offset"));
-    let head = read("HEAD", &[]);
+    assert_eq!((beyond.code, beyond.refusal().0.as_str()), (416, "RANGE_NOT_SATISFIABLE"));
+    let head = read("HEAD", &[range]);
     assert_eq!((head.code, head.body.len(), head.header("content-length")), (200, 0, whole.header("content-length")));
     let none = request(&server, "GET", "/v1/tenants/-/jobs/none/result", &[protobuf], &[]);
     assert_eq!((none.code, none.refusal().0.as_str()), (404, "JOB_NOT_FOUND"));
+    let unacceptable = ("accept", "application/x-protobuf;q=0, application/json");
+    assert_eq!(request(&server, "GET", &path, &[unacceptable], &[]).refusal().0, "RESULT_TOO_LARGE");
+    let with_a_query = request(&server, "GET", &format!("{path}?offset=5"), &[protobuf], &[]);
+    assert_eq!((with_a_query.code, with_a_query.refusal().1.as_str()), (400, "offset"));
+    assert_eq!(request(&server, "POST", &path, &[protobuf], &[]).code, 405);
+    let nobodys = request(&server, "GET", "/v1/tenants//jobs/x/result", &[protobuf], &[]);
+    assert_eq!(nobodys.refusal().0, "PATH_NOT_FOUND");
 }
 
 #[test]
@@ -502,6 +514,12 @@ fn a_key_is_asked_for_and_says_whose_jobs_are_seen() {
         request(&server, "GET", &path_of(&job), &[("authorization", &bearer)], &[]).code
     };
     assert_eq!((read(NORTH), read(SOUTH)), (200, 404));
+    let path = format!("{}/result", path_of(&job));
+    for (key, code) in [("wrong", 401), (SOUTH, 404)] {
+        let headers = [("authorization", format!("Bearer {key}")), ("accept", "application/x-protobuf".to_owned())];
+        let headers = headers.each_ref().map(|(name, value)| (*name, value.as_str()));
+        assert_eq!(request(&server, "GET", &path, &headers, &[]).code, code, "{key}");
+    }
 }
 
 #[test]

@@ -310,11 +310,11 @@ class ObservationResults:
     """What is said of every observation: entry k of an array is observation k of the input."""
 
     inlier: NDArray[np.bool_]
-    judged: NDArray[np.bool_]
-    """Whether it was judged; residual and verdict have no meaning otherwise."""
+    classified: NDArray[np.bool_]
+    """Whether it was classified; residual and verdict have no meaning otherwise."""
 
     residual_px: Floats
-    """Reprojection error (distance) in pixels; NaN where it was not judged."""
+    """Reprojection error (distance) in pixels; NaN where it was not classified."""
 
     weight: NDArray[np.float32]
     """Probability that it shows its track's point, if the track is right."""
@@ -493,15 +493,12 @@ class Result:
 
     @cached_property
     def calibrations(self) -> tuple[Calibration, ...]:
-        """One entry a camera group that was calibrated, ascending; empty without a metric reconstruction."""
+        """One entry a camera group with registered views, ascending; empty without a metric reconstruction."""
         return tuple(_calibration(message) for message in self.message.calibrations)
 
     @cached_property
     def _first_calibration(self) -> Calibration | None:
-        registered = {camera.camera_group for camera in self.cameras if camera.is_registered}
-        if not registered:
-            return None
-        return next((found for found in self.calibrations if found.camera_group in registered), None)
+        return next(iter(self.calibrations), None)
 
     @cached_property
     def cameras(self) -> tuple[Camera, ...]:
@@ -584,15 +581,15 @@ class Result:
         message = self.message.observations
         inlier = _row(message.inliers, np.bool_)
         count = len(inlier)
-        judged = _row(message.judged, np.bool_, count, "verdicts")
+        classified = _row(message.classified, np.bool_, count, "verdicts")
         residual = np.array(message.residuals_px, dtype=np.float64)
         if len(residual) != count:
             raise InternalError(f"the result has {len(residual)} residuals, {count} are due", reason="INVALID_RESULT")
-        residual[~judged] = np.nan
+        residual[~classified] = np.nan
         residual.setflags(write=False)
         return ObservationResults(
             inlier=inlier,
-            judged=judged,
+            classified=classified,
             residual_px=residual,
             weight=_row(message.weights, np.float32, count, "weights of observations"),
             split=_row(message.split_numbers if message.split_numbers else [0] * count, np.int64, count, "splits"),

@@ -85,7 +85,7 @@ def true_result(scene: Scene, job: str = "tenants/default/jobs/true", **calibrat
     of_observation = right[scene.tracks.track_index]
     count = len(scene.tracks)
     message.observations.inliers.extend(of_observation.tolist())
-    message.observations.judged.extend([True] * count)
+    message.observations.classified.extend([True] * count)
     message.observations.residuals_px.extend(np.where(of_observation, 0.5, 99.0))
     message.observations.weights.extend(of_observation.astype(float))
     message.warnings.add(code="WARNING_CODE_PRINCIPAL_POINT_UNOBSERVABLE", detail="taken to be the middle")

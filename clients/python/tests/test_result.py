@@ -111,12 +111,7 @@ def test_calibrations_are_those_of_the_groups() -> None:
     assert [calibration.camera_group for calibration in result.calibrations] == [4, 9]
     assert [camera.focal_px for camera in result.cameras] == [200.0, 100.0, 250.0]
     assert [camera.K[0, 0] for camera in result.cameras if camera.K is not None] == [200.0, 100.0, 250.0]
-    # No view is registered: there is no first camera.
-    assert (result.focal_px, result.sigma_log_focal) == (None, None)
-    message.views[2].projection.extend(range(12))
-    assert Result(message).focal_px == 200.0
-    message.views[1].projection.extend(range(12))
-    assert Result(message).focal_px == 100.0
+    assert (result.focal_px, result.sigma_log_focal) == (100.0, None)
     # A group without a calibration has no other's.
     del message.calibrations[1]
     alone = Result(message)
@@ -133,7 +128,7 @@ def test_nothing_found_is_a_result_too() -> None:
     message.tracks.weights.extend([0.0, 0.0])
     message.tracks.inliers.extend([False, False])
     message.observations.inliers.extend([False])
-    message.observations.judged.extend([False])
+    message.observations.classified.extend([False])
     message.observations.residuals_px.extend([0.0])
     message.observations.weights.extend([0.0])
     message.warnings.add(code=7, detail="none")
@@ -165,7 +160,7 @@ def test_lengths_that_do_not_fit_are_told(small: scene.Scene) -> None:
         (lambda message: message.tracks.weights.pop(), "weights of tracks"),
         (lambda message: message.tracks.point_track_indices.__setitem__(0, 120), "a track beyond its 120"),
         (lambda message: message.observations.residuals_px.pop(), "residuals"),
-        (lambda message: message.observations.judged.pop(), "verdicts"),
+        (lambda message: message.observations.classified.pop(), "verdicts"),
         (lambda message: setattr(message.calibrations[0], "lens_projection", 77), "lens is of a kind"),
         (lambda message: message.views[1].rotation.pop(), "numbers in a rotation"),
     ):

@@ -21,7 +21,7 @@ const STAGES = {
   CALIBRATE: "Calibrating", CLASSIFY: "Classifying tracks and observations",
 };
 const TASKS = {
-  ADJUST: "adjustment round", WINDOWS: "window", JUDGE: "verdict", CAMERAS: "camera group", HEADS: "network head",
+  ADJUST: "adjustment round", WINDOWS: "window", CLASSIFY: "verdict", CAMERAS: "camera group", HEADS: "network head",
 };
 const PHASES = { RELAXATION: "relaxation", RANK: "rank", GROWTH: "growth" };
 const ATTEMPT_ENDS = { ENDED: "ended the job", GIVEN_BACK: "given back by its server", LOST: "lost with its server" };
@@ -1320,7 +1320,7 @@ function resultSections(result, job) {
   const pairs = [
     ["Tracks", count((tracks.inliers || []).length), `${count(right(tracks.inliers))} inliers`],
     ["Observations", count((observations.inliers || []).length),
-      `${count(right(observations.inliers))} inliers, ${count(right(observations.judged))} judged`],
+      `${count(right(observations.inliers))} inliers, ${count(right(observations.classified))} classified`],
     ["Views", count(views.length), `${count(registered)} registered`],
     ["Points", count((tracks.pointTrackIndices || []).length),
       (result.trackSplits || []).length ? `${count(result.trackSplits.length)} more of tracks that join several` : null],
@@ -1337,7 +1337,7 @@ function resultSections(result, job) {
       facts(pairs), isMore ? [make("h4", {}, "All warnings"), warningList(warnings)] : null,
       make("h4", {}, "Cameras"), calibrationTable(result),
       make("details", {}, make("summary", {}, `Views (${count(views.length)})`), viewTable(views)),
-      make("details", {}, make("summary", {}, "Times"), table("Time by stage", times, result.stageTimes || []))),
+      make("details", {}, make("summary", {}, "Times"), table("Time by stage", times, result.stageDurations || []))),
     sceneSection(result, views),
   ];
 }

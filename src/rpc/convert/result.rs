@@ -121,7 +121,7 @@ fn digest_to_wire(digest: Option<Sha256Digest>) -> Vec<u8> {
     digest.map_or_else(Vec::new, |digest| digest.0.to_vec())
 }
 
-fn digest_from_wire(bytes: &[u8], field: &str) -> Result<Option<Sha256Digest>, Violation> {
+pub fn digest_from_wire(bytes: &[u8], field: &str) -> Result<Option<Sha256Digest>, Violation> {
     if bytes.is_empty() {
         return Ok(None);
     }
@@ -332,7 +332,7 @@ fn tracks_from_wire(tracks: proto::TrackResults) -> Result<TrackResults, Violati
 fn observations_to_wire(observations: &ObservationResults) -> proto::ObservationResults {
     proto::ObservationResults {
         inliers: observations.inlier.clone(),
-        judged: observations.residual_px.iter().map(Option::is_some).collect(),
+        classified: observations.residual_px.iter().map(Option::is_some).collect(),
         residuals_px: observations.residual_px.iter().map(|residual| residual.unwrap_or(0.0)).collect(),
         weights: observations.weight.clone(),
         split_numbers: if observations.split.iter().any(|&split| split > 0) {
@@ -365,7 +365,7 @@ fn split_from_wire((index, split): (usize, &proto::TrackSplit)) -> Result<TrackS
 
 fn observations_from_wire(mut observations: proto::ObservationResults) -> Result<ObservationResults, Violation> {
     let count = observations.inliers.len();
-    if observations.judged.len() != count || observations.residuals_px.len() != count {
+    if observations.classified.len() != count || observations.residuals_px.len() != count {
         return Err(Violation::of("observations", "arrays of different lengths"));
     }
     let lengths = [("weights", observations.weights.len()), ("split_numbers", observations.split_numbers.len())];
@@ -375,12 +375,12 @@ fn observations_from_wire(mut observations: proto::ObservationResults) -> Result
             format!("{length} entries for {count} observations"),
         ));
     }
-    let residual_px = observations.judged.iter().zip(&observations.residuals_px);
+    let residual_px = observations.classified.iter().zip(&observations.residuals_px);
     // Both are left out where they say nothing.
     observations.weights.resize(count, 0.0);
     observations.split_numbers.resize(count, 0);
     Ok(ObservationResults {
-        residual_px: residual_px.map(|(&judged, &residual)| judged.then_some(residual)).collect(),
+        residual_px: residual_px.map(|(&classified, &residual)| classified.then_some(residual)).collect(),
         weight: observations.weights,
         split: observations.split_numbers,
         inlier: observations.inliers,

@@ -167,7 +167,7 @@ async fn exhausted<C: Connection>(
     max_attempts: u32,
 ) -> Result<Failure, Error> {
     let select = Statement::new(
-        "SELECT attempt, worker, start_time, end_time, ending FROM attempts WHERE job_id = $1 \
+        "SELECT attempt, server, start_time, end_time, ending FROM attempts WHERE job_id = $1 \
          ORDER BY attempt DESC LIMIT $2",
     );
     let rows = connection.rows(select.bind(job.id).bind(MOST_PAST_ATTEMPTS)).await?;
@@ -175,7 +175,7 @@ async fn exhausted<C: Connection>(
         let ending = row.optional_text("ending")?.unwrap_or_default();
         Ok(PastAttempt {
             attempt: number(row, "attempt")?,
-            server: row.text("worker")?,
+            server: row.text("server")?,
             start_time: rows::time(row.integer("start_time")?),
             // One that is followed by another has ended, whatever is known of how.
             end_time: rows::time(row.optional_integer("end_time")?.unwrap_or(row.integer("start_time")?)),
@@ -189,7 +189,7 @@ async fn exhausted<C: Connection>(
         .map(|past| format!("{} by {}", past.attempt, past.server))
         .collect();
     let message = format!(
-        "{lost_attempts} attempts ended without a word from their worker, at most {max_attempts} are made: {}",
+        "{lost_attempts} attempts ended without a word from their server, at most {max_attempts} are made: {}",
         told.join(", ")
     );
     Ok(Failure { reason: ATTEMPTS_EXHAUSTED.into(), message, attempts })

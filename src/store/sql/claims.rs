@@ -179,7 +179,7 @@ async fn begin<C: Connection>(
     .bind(micros(lease_now + claim.lease_for))
     .bind(integer(sequence))
     .bind(job.id);
-    let begin = Statement::new("INSERT INTO attempts (job_id, attempt, worker, start_time) VALUES ($1, $2, $3, $4)")
+    let begin = Statement::new("INSERT INTO attempts (job_id, attempt, server, start_time) VALUES ($1, $2, $3, $4)")
         .bind(job.id)
         .bind(attempt)
         .bind(&claim.worker)

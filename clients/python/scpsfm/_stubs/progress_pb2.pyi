@@ -15,8 +15,8 @@ class Stage(int, metaclass=_enum_type_wrapper.EnumTypeWrapper):
     STAGE_SEARCH: _ClassVar[Stage]
     STAGE_REFINE: _ClassVar[Stage]
     STAGE_CALIBRATE: _ClassVar[Stage]
-    STAGE_CLASSIFY: _ClassVar[Stage]
     STAGE_EXTEND: _ClassVar[Stage]
+    STAGE_CLASSIFY: _ClassVar[Stage]
 
 class Phase(int, metaclass=_enum_type_wrapper.EnumTypeWrapper):
     __slots__ = ()
@@ -38,8 +38,8 @@ STAGE_PREPARE: Stage
 STAGE_SEARCH: Stage
 STAGE_REFINE: Stage
 STAGE_CALIBRATE: Stage
-STAGE_CLASSIFY: Stage
 STAGE_EXTEND: Stage
+STAGE_CLASSIFY: Stage
 PHASE_UNSPECIFIED: Phase
 PHASE_RELAXATION: Phase
 PHASE_RANK: Phase

@@ -225,18 +225,18 @@ class TrackResults(_message.Message):
     def __init__(self, weights: _Optional[_Iterable[float]] = ..., inliers: _Optional[_Iterable[bool]] = ..., network_weights: _Optional[_Iterable[float]] = ..., point_track_indices: _Optional[_Iterable[int]] = ..., points: _Optional[_Iterable[float]] = ..., point_parts: _Optional[_Iterable[int]] = ..., second_structure_numbers: _Optional[_Iterable[int]] = ...) -> None: ...
 
 class ObservationResults(_message.Message):
-    __slots__ = ("inliers", "judged", "residuals_px", "weights", "split_numbers")
+    __slots__ = ("inliers", "classified", "residuals_px", "weights", "split_numbers")
     INLIERS_FIELD_NUMBER: _ClassVar[int]
-    JUDGED_FIELD_NUMBER: _ClassVar[int]
+    CLASSIFIED_FIELD_NUMBER: _ClassVar[int]
     RESIDUALS_PX_FIELD_NUMBER: _ClassVar[int]
     WEIGHTS_FIELD_NUMBER: _ClassVar[int]
     SPLIT_NUMBERS_FIELD_NUMBER: _ClassVar[int]
     inliers: _containers.RepeatedScalarFieldContainer[bool]
-    judged: _containers.RepeatedScalarFieldContainer[bool]
+    classified: _containers.RepeatedScalarFieldContainer[bool]
     residuals_px: _containers.RepeatedScalarFieldContainer[float]
     weights: _containers.RepeatedScalarFieldContainer[float]
     split_numbers: _containers.RepeatedScalarFieldContainer[int]
-    def __init__(self, inliers: _Optional[_Iterable[bool]] = ..., judged: _Optional[_Iterable[bool]] = ..., residuals_px: _Optional[_Iterable[float]] = ..., weights: _Optional[_Iterable[float]] = ..., split_numbers: _Optional[_Iterable[int]] = ...) -> None: ...
+    def __init__(self, inliers: _Optional[_Iterable[bool]] = ..., classified: _Optional[_Iterable[bool]] = ..., residuals_px: _Optional[_Iterable[float]] = ..., weights: _Optional[_Iterable[float]] = ..., split_numbers: _Optional[_Iterable[int]] = ...) -> None: ...
 
 class TrackSplit(_message.Message):
     __slots__ = ("track_index", "number", "weight", "point")

@@ -336,7 +336,7 @@ pub struct Solution {
     /// Network iterations spent.
     pub iterations: u32,
     pub seed: u64,
-    /// One entry a camera group that was calibrated, ascending; empty without a metric reconstruction: see
+    /// One entry a camera group with registered views, ascending; empty without a metric reconstruction: see
     /// [`Solution::is_metric`].
     pub calibrations: Vec<Calibration>,
     /// Plane at infinity `(n, 1)` in pixels and in the frame `P1 = [I|0]` of the first registered view.
@@ -392,22 +392,15 @@ impl Solution {
     /// Points of the curves in a report; more than a plot has pixels for is waste.
     pub const MAX_HISTORY: usize = 500;
 
-    /// The camera groups of the views, ascending, and the calibration of each that has one.
+    /// The camera groups of the views, ascending, each with its calibration.
     pub fn cameras(&self) -> Vec<(u32, Option<&Calibration>)> {
         let groups: BTreeSet<u32> = self.views.iter().map(|view| view.camera_group).collect();
         groups.into_iter().map(|group| (group, self.calibration_of(group))).collect()
     }
 
-    /// The calibration of a camera group; `None`: it has none.
+    /// The calibration of a camera group; `None`: no view of it is registered, or nothing is metric.
     pub fn calibration_of(&self, camera_group: u32) -> Option<&Calibration> {
         self.calibrations.iter().find(|calibration| calibration.camera_group == camera_group)
-    }
-
-    /// The calibration of the first camera group that has registered views.
-    pub fn first_calibration(&self) -> Option<&Calibration> {
-        let is_seen =
-            |group: u32| self.views.iter().any(|view| view.camera_group == group && view.projection.is_some());
-        self.cameras().into_iter().find(|(group, _)| is_seen(*group)).and_then(|(_, calibration)| calibration)
     }
 
     /// How many reconstructions there are, each with a frame of its own.

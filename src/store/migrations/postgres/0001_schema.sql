@@ -151,7 +151,7 @@ CREATE TABLE attempts (
     job_id     BIGINT NOT NULL REFERENCES jobs (id) ON DELETE CASCADE,
     attempt    BIGINT NOT NULL,
     -- The process that made it.
-    worker     TEXT    NOT NULL,
+    server     TEXT    NOT NULL,
     start_time BIGINT NOT NULL,
     end_time   BIGINT,
     ending     TEXT CHECK (ending IN ('ENDED', 'GIVEN_BACK', 'LOST')),

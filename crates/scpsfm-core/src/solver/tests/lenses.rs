@@ -235,7 +235,7 @@ fn a_fisheye_is_found_and_calibrated() {
             let scene = Photographed::generate(&fisheye(motion, seed)).expect("valid options");
             let input = Input::new(scene.input.clone(), &Limits::default(), "scene").expect("valid input");
             let solution = solved(&input, &SolveSettings::default());
-            let calibration = solution.first_calibration().copied();
+            let calibration = solution.calibrations.first().copied();
             println!("{motion:?}, seed {seed}: {:?} {calibration:?} {:?}", solution.grade, solution.warnings);
             assert_eq!(solution.grade, Some(Grade::Metric), "{motion:?}, seed {seed}");
             let calibration = calibration.expect("metric");

@@ -327,6 +327,8 @@ fn a_camera_of_which_no_view_is_registered_takes_nothing_from_the_others() {
     assert_eq!(solution.grade, Some(Grade::Metric), "{:?}", solution.warnings);
     let of_lost = solution.warnings.iter().find(|warning| warning.camera_group == Some(3)).expect("a warning");
     assert!(of_lost.detail.starts_with("camera group 3: only 0 views are registered"), "{of_lost:?}");
+    let groups: Vec<u32> = solution.calibrations.iter().map(|calibration| calibration.camera_group).collect();
+    assert_eq!(groups, [0]);
 }
 
 #[test]
