@@ -7,6 +7,7 @@ use clap::{Args, ValueEnum};
 
 use super::access::AccessArgs;
 use super::exit::Failure;
+use super::job_view::quoted;
 use crate::client::{Client, MAX_WAIT};
 use crate::domain::{Backend, FocalPrior, ImageSize, Limits, Method, Solution, SolveSettings};
 use crate::formats::{self, Export, Format, LabelledInput, Matches, Reading, result_files};
@@ -150,6 +151,14 @@ pub struct ReadingArgs {
         help = format!("One standard deviation of log(--focal-px), a relative error: .1 is 10 % \
         [default: {FOCAL_SIGMA_LOG}]"))]
     pub focal_sigma: Option<f64>,
+
+    /// Cameras, sizes and focal lengths of single views of a CSV: a CSV with a header
+    /// `view[,camera_group][,width,height][,focal_px[,focal_sigma]]`
+    ///
+    /// Views of one camera group have one constant calibration; by default all are in group 0. An empty cell, or a view
+    /// that is not listed, has what the other flags say.
+    #[arg(long, help_heading = READING, value_name = "FILE")]
+    pub view_table: Option<PathBuf>,
 }
 
 /// Standard deviation of the logarithm of a focal length that is given without one: that of EXIF.
@@ -180,6 +189,9 @@ impl ReadingArgs {
         if let Some(sigma) = self.focal_sigma {
             flags.push_str(&format!(" --focal-sigma {sigma}"));
         }
+        if let Some(table) = &self.view_table {
+            flags.push_str(&format!(" --view-table {}", quoted(&table.display().to_string())));
+        }
         flags
     }
 
@@ -195,6 +207,7 @@ impl ReadingArgs {
             focal_prior: self
                 .focal_px
                 .map(|focal_px| FocalPrior { focal_px, sigma_log: self.focal_sigma.unwrap_or(FOCAL_SIGMA_LOG) }),
+            view_table: self.view_table.clone(),
         };
         Ok(formats::read(path, &Limits::default(), &reading)?)
     }

@@ -35,7 +35,10 @@ const REMEDIES: [(WarningCode, &str); 14] = [
     ),
     (WarningCode::FewInliers, "add tracks that three views or more share: more features, or photos with more overlap"),
     (WarningCode::NoConsensus, "check the matches and the order of the views; add longer tracks"),
-    (WarningCode::CameraGroupsMerged, "make each camera a group of its own, and use --method auto or geometry"),
+    (
+        WarningCode::CameraGroupsMerged,
+        "make each camera a group of its own (--view-table), and use --method auto or geometry",
+    ),
     (WarningCode::AssumedImageSize, "give the size of the images (--width, --height)"),
 ];
 

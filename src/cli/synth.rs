@@ -7,9 +7,9 @@ pub use super::scene_args::SceneArgs;
 use super::scene_args::{CameraArgs, GeometryArgs, OutlierArgs};
 use crate::domain::error::quoted;
 use crate::domain::{ImageSize, RawInput};
-use crate::formats::observations;
 use crate::formats::publish::{create_directory, pretty, write_atomically};
 use crate::formats::result_files::OBSERVATIONS;
+use crate::formats::{observations, view_table};
 use crate::synthetic::photographed::IMAGE_SIZE;
 pub use crate::synthetic::scene::IMAGE_SIDE_PX;
 use crate::synthetic::{Photographed, PhotographedOptions, Scene, Sequence, SequenceOptions};
@@ -18,6 +18,8 @@ use crate::synthetic::{Photographed, PhotographedOptions, Scene, Sequence, Seque
 const SQUARE: ImageSize = ImageSize { width_px: IMAGE_SIDE_PX, height_px: IMAGE_SIDE_PX };
 /// Name of the file that holds what the scene was made of.
 pub const TRUTH: &str = "truth.json";
+/// Name of the table of views.
+pub const VIEWS: &str = "views.csv";
 
 const EXAMPLES: &str = "\
 Examples:
@@ -28,18 +30,19 @@ Examples:
   scpsfm synth --out scene --outliers 0.3 --wrong-observations 2   # right tracks that are wrong in 2 of 10 views
   scpsfm synth --out walk --sequence --views 100 --tracks 5000 --noise 0.0005 --outliers 0.5   # tracks of 3 to 10 views
   scpsfm synth --out photographed --photographed --seed 7   # truth.json says what was drawn
+  scpsfm solve photographed/observations.csv --view-table photographed/views.csv --out answer
   scpsfm solve scene/observations.csv --width 1000 --height 1000 --out answer";
 
 /// Make a contaminated scene whose truth is known
 ///
 /// The generator of the paper's section 5.1: points in a box, cameras of one focal length around it, noise, and tracks
 /// whose image points are exchanged among each other; and departures from it, among them motions that no
-/// self-calibration survives. Writes observations.csv and truth.json; images are 1000 x 1000 px, and points are where
-/// the cameras project them, many of them outside; those of --photographed are inside, of 1600 x 1200 px.
+/// self-calibration survives. Writes observations.csv, views.csv and truth.json; images are 1000 x 1000 px, and points
+/// are where the cameras project them, many of them outside; those of --photographed are inside, of 1600 x 1200 px.
 #[derive(Debug, clap::Args)]
 #[command(after_help = EXAMPLES)]
 pub struct Args {
-    /// Directory for observations.csv and truth.json; created
+    /// Directory for observations.csv, views.csv (camera group and size of each view) and truth.json; created
     #[arg(long, value_name = "DIR")]
     pub out: PathBuf,
 
@@ -205,7 +208,7 @@ fn focal(focal_px: f64, zoom: f64) -> String {
     }
 }
 
-/// Writes observations.csv and truth.json.
+/// Writes observations.csv, views.csv and truth.json.
 ///
 /// # Errors
 /// The file that cannot be written.
@@ -222,6 +225,7 @@ fn write<O: serde::Serialize, T: serde::Serialize>(
 ) -> Result<(), Failure> {
     create_directory(directory)?;
     write_atomically(directory, OBSERVATIONS, observations::csv(input).as_bytes())?;
+    write_atomically(directory, VIEWS, view_table::csv(input).as_bytes())?;
     let truth = TruthJson { options, image_width_px: size.width_px, image_height_px: size.height_px, truth };
     write_atomically(directory, TRUTH, pretty(&truth)?.as_bytes())?;
     Ok(())
@@ -258,7 +262,7 @@ mod tests {
             let args = args(&out, more);
             let scene = args.generate().expect("valid options");
             assert_eq!(run(args), Ok(Exit::Done));
-            let reading = Reading { size: Some(SQUARE), ..Reading::default() };
+            let reading = Reading { view_table: Some(out.join(VIEWS)), ..Reading::default() };
             let read = formats::read(&out.join(OBSERVATIONS), &Limits::default(), &reading).expect("a valid file");
             assert_eq!(read.raw.views, scene.input.views);
             assert_eq!((&read.raw.view, &read.raw.track), (&scene.input.view, &scene.input.track));

@@ -22,6 +22,7 @@ pub mod result_files;
 pub mod result_json;
 pub mod source;
 mod text;
+pub mod view_table;
 pub mod warnings;
 pub mod windows;
 

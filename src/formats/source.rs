@@ -2,11 +2,11 @@
 
 use std::fs::File;
 use std::io::{BufRead, BufReader, Cursor, Read};
-use std::path::Path;
+use std::path::{Path, PathBuf};
 
 use super::error::Error;
 use super::input::{LabelledInput, display_path};
-use super::{colmap, observations, opensfm, text};
+use super::{colmap, observations, opensfm, text, view_table};
 use crate::domain::{FocalPrior, ImageSize, Limits};
 
 /// The path that stands for standard input, as with most programs.
@@ -54,6 +54,8 @@ pub struct Reading {
     pub matches: Option<Matches>,
     /// What is known of the focal length of every view beforehand, in place of what the file says of it.
     pub focal_prior: Option<FocalPrior>,
+    /// A table of cameras, sizes and focal lengths of single views, for files that carry none; see [`view_table`].
+    pub view_table: Option<PathBuf>,
 }
 
 /// Standard input or a pipe: it can be read once.
@@ -103,6 +105,9 @@ pub fn read(path: &Path, limits: &Limits, reading: &Reading) -> Result<LabelledI
     if reading.matches.is_some() && format != Format::ColmapDatabase {
         return Err(whole("is no COLMAP database; leave out --matches".into()));
     }
+    if reading.view_table.is_some() && format != Format::Observations {
+        return Err(whole("carries the cameras of its images; leave out --view-table".into()));
+    }
     let table = || -> Result<Box<dyn BufRead>, Error> {
         Ok(match stream {
             Some(Stream { beginning, rest }) => Box::new(BufReader::new(Cursor::new(beginning).chain(rest))),
@@ -119,6 +124,11 @@ pub fn read(path: &Path, limits: &Limits, reading: &Reading) -> Result<LabelledI
     labelled.name_views();
     if reading.focal_prior.is_some() {
         labelled.raw.views.iter_mut().for_each(|view| view.focal_prior = reading.focal_prior);
+    }
+    if let Some(table) = &reading.view_table {
+        view_table::apply(table, limits, &mut labelled)?;
+    }
+    if reading.focal_prior.is_some() || reading.view_table.is_some() {
         labelled.check(limits)?;
     }
     Ok(labelled)
@@ -236,6 +246,9 @@ mod tests {
         let size = Some(ImageSize { width_px: 4, height_px: 3 });
         let database = Reading { size, format: Some(Format::ColmapDatabase), ..Reading::default() };
         assert!(refused(database).contains("leave out --width and --height"));
+        let view_table = Some("views.csv".into());
+        let cameras = Reading { view_table, format: Some(Format::ColmapDatabase), ..Reading::default() };
+        assert!(refused(cameras).contains("leave out --view-table"));
         let table = Reading { format: Some(Format::Observations), ..Reading::default() };
         assert!(refused(table).contains("is an OpenSfM tracks.csv"));
     }
