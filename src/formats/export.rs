@@ -1,8 +1,8 @@
 //! A result for other programs, in directories of their own below that of the result files.
 
 use std::fmt;
-use std::io;
 use std::path::{Path, PathBuf};
+use std::{io, iter};
 
 use super::metric::{self, Model};
 use super::publish::{Draft, pretty};
@@ -156,10 +156,12 @@ impl Export {
                 ("camera_models.json".into(), pretty(&opensfm::reconstruction::camera_models(models))?.into()),
             ]),
             Export::Nerfstudio => match models.first().map(nerfstudio::transforms) {
-                Some(Ok(transforms)) => Ok(vec![
-                    ("transforms.json".into(), pretty(&transforms)?.into()),
-                    (nerfstudio::POINTS.into(), ply::of_model(&models[0]).into()),
-                ]),
+                Some(Ok(transforms)) => {
+                    let points = (nerfstudio::POINTS.into(), ply::of_model(&models[0]).into());
+                    let has_points = !models[0].points.is_empty();
+                    let transforms = ("transforms.json".into(), pretty(&transforms)?.into());
+                    Ok(iter::once(transforms).chain(has_points.then_some(points)).collect())
+                }
                 Some(Err(refused)) => Err(refused.into()),
                 None => Err(metric::Error::NoPose.into()),
             },

@@ -48,7 +48,9 @@ pub fn transforms(model: &Model) -> Result<Value, Error> {
         Value::Object(frame)
     };
     file.insert("frames".into(), model.images.iter().map(frame).collect());
-    file.insert("ply_file_path".into(), POINTS.into());
+    if !model.points.is_empty() {
+        file.insert("ply_file_path".into(), POINTS.into());
+    }
     Ok(Value::Object(file))
 }
 

@@ -78,6 +78,15 @@ fn intrinsics_stand_at_the_frames_where_they_differ() {
 }
 
 #[test]
+fn a_camera_that_only_turned_has_no_points_to_name() {
+    let (input, mut solution) = fixture::solved();
+    assert_eq!(transforms_of(&solution, &input)["ply_file_path"], POINTS);
+    solution.tracks.point.fill(None);
+    solution.splits.clear();
+    assert_eq!(transforms_of(&solution, &input).get("ply_file_path"), None);
+}
+
+#[test]
 fn two_lens_projections_are_refused() {
     let (mut input, mut solution) = fixture::solved();
     for view in 3..5 {

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import sqlite3
 from contextlib import closing
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -206,6 +207,24 @@ def test_nerfstudio_projects_to_the_same_pixels(small: scene.Scene, tmp_path: Pa
     assert f"element vertex {len(body)}" in lines
     points = np.array([[float(value) for value in line.split()[:3]] for line in body])
     assert points == pytest.approx(result.points)
+
+
+def test_nerfstudio_is_told_of_no_points_where_there_are_none(small: scene.Scene, tmp_path: Path) -> None:
+    message = scene.true_result(small)
+    for field in ("points", "point_track_indices", "point_parts"):
+        message.tracks.ClearField(field)
+    Result(message, small.tracks).to_nerfstudio(tmp_path)
+    assert "ply_file_path" not in json.loads((tmp_path / "transforms.json").read_text())
+    assert not (tmp_path / "points.ply").exists()
+
+
+def test_opensfm_names_have_no_folders_where_they_differ_without(small: scene.Scene, tmp_path: Path) -> None:
+    for last, expected in (("e.jpg", "e.jpg"), ("0.jpg", "right/0.jpg")):
+        names = [f"left/{view}.jpg" for view in range(len(small.tracks.views) - 1)] + [f"right/{last}"]
+        views = [replace(view, name=name) for view, name in zip(small.tracks.views, names, strict=True)]
+        Result(scene.true_result(small), replace(small.tracks, views=views)).to_opensfm(tmp_path)
+        shots = json.loads((tmp_path / "reconstruction.json").read_text())[0]["shots"]
+        assert expected in shots
 
 
 def test_nerfstudio_frames_have_their_own_intrinsics_where_cameras_differ(small: scene.Scene, tmp_path: Path) -> None:

@@ -5,7 +5,7 @@ use std::collections::{HashMap, HashSet};
 
 use serde_json::{Map, Value, json};
 
-use super::frame;
+use super::{frame, shot_names};
 use crate::domain::LensProjection;
 use crate::formats::metric::{Camera, Image, Model, Point};
 
@@ -19,7 +19,7 @@ const MIDDLE_PX: f64 = 1e-6;
 /// is an angle-axis vector, world to camera.
 pub fn json(models: &[Model]) -> Value {
     let names = CameraNames::of(models);
-    models.iter().map(|model| reconstruction(model, &names)).collect()
+    models.iter().zip(shot_names(models)).map(|(model, shots)| reconstruction(model, &names, shots)).collect()
 }
 
 /// `camera_models.json`: every camera of the reconstructions under its name in these.
@@ -27,12 +27,12 @@ pub fn camera_models(models: &[Model]) -> Value {
     Value::Object(CameraNames::of(models).cameras)
 }
 
-fn reconstruction(model: &Model, names: &CameraNames) -> Value {
+fn reconstruction(model: &Model, names: &CameraNames, shots: Vec<String>) -> Value {
     let names = names.of_model(model);
     let cameras: Map<String, Value> =
         names.iter().zip(&model.cameras).map(|(name, camera)| ((*name).to_owned(), self::camera(camera))).collect();
     let shots: Map<String, Value> =
-        model.images.iter().map(|image| (image.name.to_string(), shot(image, names[image.camera]))).collect();
+        shots.into_iter().zip(&model.images).map(|(name, image)| (name, shot(image, names[image.camera]))).collect();
     let points: Map<String, Value> = point_names(model).into_iter().zip(model.points.iter().map(point)).collect();
     json!({ "cameras": cameras, "shots": shots, "points": points })
 }

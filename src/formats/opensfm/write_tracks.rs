@@ -2,8 +2,8 @@
 
 use std::fmt::Write;
 
-use super::frame;
 use super::reconstruction::point_names;
+use super::{frame, shot_names};
 use crate::formats::metric::Model;
 
 const HEADER: &str = "OPENSFM_TRACKS_VERSION_v2";
@@ -19,7 +19,7 @@ const NONE: &str = "-1\t-1";
 pub fn csv(models: &[Model], noise_px: Option<f64>) -> String {
     let noise_px = noise_px.filter(|noise| noise.is_finite() && *noise > 0.0).unwrap_or(DEFAULT_NOISE_PX);
     let mut text = format!("{HEADER}\n");
-    for model in models {
+    for (model, shots) in models.iter().zip(shot_names(models)) {
         let mut lines: Vec<(usize, usize, usize)> = Vec::new();
         for (place, point) in model.points.iter().enumerate() {
             lines.extend(point.seen.iter().map(|&(image, keypoint)| (image, keypoint, place)));
@@ -27,6 +27,7 @@ pub fn csv(models: &[Model], noise_px: Option<f64>) -> String {
         lines.sort_unstable();
         let names = point_names(model);
         for (image, keypoint, place) in lines {
+            let shot = &shots[image];
             let image = &model.images[image];
             let (middle_px, side_px) = frame(model.cameras[image.camera].size);
             let seen = &image.keypoints[keypoint];
@@ -35,8 +36,7 @@ pub fn csv(models: &[Model], noise_px: Option<f64>) -> String {
             // Writing to a String cannot fail.
             let _ = writeln!(
                 text,
-                "{}\t{}\t{}\t{x}\t{y}\t{}\t{red}\t{green}\t{blue}\t{NONE}",
-                image.name,
+                "{shot}\t{}\t{}\t{x}\t{y}\t{}\t{red}\t{green}\t{blue}\t{NONE}",
                 names[place],
                 seen.index,
                 noise_px / side_px
@@ -53,6 +53,21 @@ mod tests {
     use crate::formats::lens_fixture::{lens, scene_of};
     use crate::formats::opensfm::{reconstruction, tracks};
     use crate::formats::{Label, LabelledInput, fixture};
+
+    #[test]
+    fn images_of_folders_have_names_without_them_where_these_differ() {
+        let (mut input, solution) = fixture::solved();
+        for (last, expected) in [("e.jpg", "e.jpg"), ("a.jpg", "right/a.jpg")] {
+            let names = ["left/a.jpg", "left/b.jpg", "right/c.jpg", "d.jpg", &format!("right/{last}")];
+            input.view_labels = names.iter().map(|name| Label::Name((*name).into())).collect();
+            let models = Model::of_parts(&solution, &input).expect("metric");
+            let shots = &reconstruction::json(&models)[0]["shots"];
+            let text = csv(&models, None);
+            let names: Vec<&str> = text.lines().skip(1).filter_map(|line| line.split('\t').next()).collect();
+            assert!(shots.get(expected).is_some() && names.contains(&expected), "{shots}");
+            assert!(names.iter().all(|name| shots.get(name).is_some()), "{names:?}");
+        }
+    }
 
     #[test]
     fn the_right_observations_come_back_under_their_names() {

@@ -48,7 +48,8 @@ def to_nerfstudio(
         raise InvalidArgument(f"part: {what}", reason="INVALID_ARGUMENT", violations=[Violation("part", what)])
     folder = Path(path)
     folder.mkdir(parents=True, exist_ok=True)
-    (folder / _POINTS).write_text(_ply(found), encoding="ascii")
+    if found.points:
+        (folder / _POINTS).write_text(_ply(found), encoding="ascii")
     content = json.dumps(_transforms(found, images), indent=1, allow_nan=False)
     (folder / "transforms.json").write_text(content + "\n", encoding="utf-8")
 
@@ -75,7 +76,8 @@ def _transforms(model: Model, images: str) -> dict[str, Any]:
     top = dict(common)
     if not common and len(kinds) == 1:
         top["camera_model"] = kinds.pop()
-    return {**top, "ply_file_path": _POINTS, "frames": frames}
+    points = {"ply_file_path": _POINTS} if model.points else {}
+    return {**top, **points, "frames": frames}
 
 
 def _intrinsics(camera: Intrinsics) -> dict[str, Any]:

@@ -28,7 +28,7 @@ def to_opensfm(tracks: Tracks, path: str | PathLike[str], result: Result) -> Non
     """Writes `reconstruction.json` of a metric result: a list of reconstructions, one a part, the largest first.
 
     Args:
-        tracks: The input; the names of its views are those of the shots.
+        tracks: The input; the names of its views are those of the shots, without folders where they differ without.
         path: Folder that it is written into; made where it is not there.
         result: What was found of it.
 
@@ -38,14 +38,18 @@ def to_opensfm(tracks: Tracks, path: str | PathLike[str], result: Result) -> Non
         OSError: The file cannot be written.
 
     """
-    found = [_reconstruction(model) for model in models(tracks, result)]
+    parts = models(tracks, result)
+    names = [name for model in parts for name in model.names]
+    # OpenSfM keeps all images in one folder: a name has no folders, unless two images would have one name then.
+    is_unique = len({name.rpartition("/")[2] for name in names}) == len(names)
+    found = [_reconstruction(model, is_unique) for model in parts]
     folder = Path(path)
     folder.mkdir(parents=True, exist_ok=True)
     content = json.dumps(found, indent=1, allow_nan=False)
     (folder / "reconstruction.json").write_text(content + "\n", encoding="utf-8")
 
 
-def _reconstruction(model: Model) -> dict[str, Any]:
+def _reconstruction(model: Model, without_folders: bool) -> dict[str, Any]:
     points: dict[str, Any] = {}
     for label, position, weight in model.points:
         name = str(label)
@@ -56,7 +60,7 @@ def _reconstruction(model: Model) -> dict[str, Any]:
     shots = {}
     for view, camera, name in zip(model.views, model.camera_of, model.names, strict=True):
         assert view.R is not None and view.t is not None
-        shots[name] = {
+        shots[name.rpartition("/")[2] if without_folders else name] = {
             "camera": _name(model.cameras[camera]),
             "rotation": _angle_axis(view.R),
             "translation": view.t.tolist(),
