@@ -1,5 +1,6 @@
 //! Arguments that several commands share.
 
+use std::iter;
 use std::path::{Path, PathBuf};
 use std::str::FromStr;
 
@@ -244,14 +245,22 @@ impl ExportArgs {
 
     /// Refuses, before any work, a directory in which the result would replace what it is made from, and an export that
     /// no result of an input of this kind has.
-    pub fn check(&self, directory: &Path, input: &Path, format: Option<Format>) -> Result<(), Failure> {
+    pub fn check(
+        &self,
+        directory: &Path,
+        input: &Path,
+        view_table: Option<&Path>,
+        format: Option<Format>,
+    ) -> Result<(), Failure> {
         if self.export.contains(&ExportArg::ColmapDb) && format != Some(Format::ColmapDatabase) {
             return Err(Failure::usage(format_args!(
                 "--export colmap-db: {} is no COLMAP database: there is none to copy",
                 input.display()
             )));
         }
-        match result_files::replaced(directory, &self.exports(), input) {
+        let exports = self.exports();
+        let mut read = iter::once(input).chain(view_table);
+        match read.find_map(|path| result_files::replaced(directory, &exports, path)) {
             Some(place) => Err(Failure::usage(format_args!(
                 "--out {}: the result would replace its own input, {}: give another directory",
                 directory.display(),

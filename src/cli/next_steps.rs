@@ -13,8 +13,8 @@ const REMEDIES: [(WarningCode, &str); 14] = [
     (WarningCode::PointsOutsideImage, "give the size of the images whose pixels these are (--width, --height)"),
     (
         WarningCode::ModelMismatch,
-        "if the camera zoomed, use --focal-per-view; if there were several cameras, make each a camera group; else \
-         check the tracks",
+        "if the camera zoomed, use --focal-per-view; if there were several cameras, make each a camera group \
+         (--view-table); else check the tracks",
     ),
     (WarningCode::Cheirality, "check the order of the views and the size of the images"),
     (WarningCode::PlanarOrRotation, "add views from other places, and objects off the plane"),

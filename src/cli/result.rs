@@ -68,7 +68,7 @@ pub async fn run(args: Args) -> Result<Exit, Failure> {
         )));
     }
     if let (Some(out), Some(path), Some(input)) = (&args.out, &args.input, &input) {
-        args.export.check(out, path, input.format)?;
+        args.export.check(out, path, args.reading.view_table.as_deref(), input.format)?;
     }
     let name = args.name.of(&args.server.access)?;
     let solution = args.server.connect().await?.read_result(&name).await?;
@@ -120,8 +120,8 @@ fn belongs_together(input: &LabelledInput, solution: &Solution) -> Result<(), Fa
         return Ok(());
     }
     let differs = other_names(input, solution).unwrap_or_else(|| {
-        "its observations, their order, or what is known of its views (--width, --height, --focal-px, --focal-sigma) \
-         are others"
+        "its observations, their order, or what is known of its views (--width, --height, --focal-px, --focal-sigma, \
+         --view-table) are others"
             .into()
     });
     let message = format!("the file is not the job's input: {differs}, and verdicts go by place");

@@ -99,7 +99,8 @@ pub async fn run(args: Args) -> Result<Exit, Failure> {
         tell_notes(&input);
     }
     // Found out now rather than after the work.
-    args.export.check(&args.out, &args.input.input, input.format)?;
+    let view_table = args.input.reading.view_table.as_deref();
+    args.export.check(&args.out, &args.input.input, view_table, input.format)?;
     create_directory(&args.out)?;
     let threads = args.threads.map_or_else(Threads::one_a_core, |count| Threads::new(count.into()));
     if let Some(length) = args.window.window {

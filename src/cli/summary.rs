@@ -22,7 +22,7 @@ pub fn text(solution: &Solution, input: Option<&LabelledInput>) -> String {
         (Some(only), [_]) => fact("focal", focal(only.focal_px, only.sigma_log_focal)),
         (Some(_), several) => {
             for camera in several.iter().take(MOST_CAMERAS) {
-                fact(&format!("camera {}", camera.camera_group), self::camera(camera));
+                fact(&format!("camera {} ", camera.camera_group), self::camera(camera));
             }
             if several.len() > MOST_CAMERAS {
                 fact("", format!("and {} more cameras: see result.json", several.len() - MOST_CAMERAS));

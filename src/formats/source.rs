@@ -106,7 +106,9 @@ pub fn read(path: &Path, limits: &Limits, reading: &Reading) -> Result<LabelledI
         return Err(whole("is no COLMAP database; leave out --matches".into()));
     }
     if reading.view_table.is_some() && format != Format::Observations {
-        return Err(whole("carries the cameras of its images; leave out --view-table".into()));
+        return Err(whole(
+            "is no table view,track,x,y; its cameras come from its own files; leave out --view-table".into(),
+        ));
     }
     let table = || -> Result<Box<dyn BufRead>, Error> {
         Ok(match stream {
@@ -124,12 +126,13 @@ pub fn read(path: &Path, limits: &Limits, reading: &Reading) -> Result<LabelledI
     labelled.name_views();
     if reading.focal_prior.is_some() {
         labelled.raw.views.iter_mut().for_each(|view| view.focal_prior = reading.focal_prior);
+        labelled.check(limits)?;
     }
     if let Some(table) = &reading.view_table {
+        if table == Path::new(STANDARD_INPUT) {
+            return Err(Error::whole("--view-table", "is read from a file, not from standard input"));
+        }
         view_table::apply(table, limits, &mut labelled)?;
-    }
-    if reading.focal_prior.is_some() || reading.view_table.is_some() {
-        labelled.check(limits)?;
     }
     Ok(labelled)
 }

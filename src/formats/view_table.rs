@@ -4,89 +4,135 @@ use std::collections::BTreeMap;
 use std::path::Path;
 
 use csv::{ErrorKind, Position, ReaderBuilder, StringRecord, Trim};
-use serde::Deserialize;
 
 use super::colmap::cameras::PRIOR_SIGMA_LOG;
 use super::error::{Error, Problem, Problems};
 use super::input::{LabelledInput, display_path};
 use super::label::Label;
-use super::text;
+use super::text::{self, quote};
 use crate::domain::{FocalPrior, ImageSize, Limits, RawInput, View};
 
-/// What a line says of a view. An empty cell says nothing.
-#[derive(Debug, Deserialize)]
-#[serde(deny_unknown_fields)]
-struct Row {
-    view: u64,
-    camera_group: Option<u32>,
-    width: Option<u32>,
-    height: Option<u32>,
-    focal_px: Option<f64>,
-    focal_sigma: Option<f64>,
-}
+const COLUMNS: [&str; 6] = ["view", "camera_group", "width", "height", "focal_px", "focal_sigma"];
+/// Views that a sentence names.
+const MOST_NAMED: usize = 3;
 
-/// Says of the views of `labelled` what the table at `path` does; of others that it lists there is a note. The values are
-/// checked by [`LabelledInput::check`].
+/// A wrong cell: its column, and what is wrong.
+type Wrong = (&'static str, String);
+
+/// Says of the views of `labelled` what the table at `path` does. Views without observations are named in a note.
 ///
 /// # Errors
-/// A file that is no such table, by line and column; a view that it lists twice.
+/// A file that is no such table, by line and column; a view that it lists twice; no view of the input.
 pub fn apply(path: &Path, limits: &Limits, labelled: &mut LabelledInput) -> Result<(), Error> {
     let file = display_path(path);
     let mut reader = ReaderBuilder::new().trim(Trim::All).from_reader(text::open_table(path, limits)?);
-    let header = reader.headers().map_err(|error| Error::one(&file, problem(&error, &StringRecord::new())))?.clone();
+    let header = reader.headers().map_err(|error| Error::one(&file, problem(&error)))?.clone();
+    check(&header).map_err(|what| Error::one(&file, Problem::at_line(1, "", what)))?;
     let positions: BTreeMap<&Label, usize> = labelled.view_labels.iter().zip(0..).collect();
     let mut lines: BTreeMap<u64, u64> = BTreeMap::new();
     let mut problems = Problems::default();
-    let mut absent = 0;
+    let mut absent = Vec::new();
     for record in reader.records() {
-        let row = record.and_then(|record| Ok((line_of(record.position()), record.deserialize::<Row>(Some(&header))?)));
-        let (line, row) = match row {
-            Ok(row) => row,
+        let record = match record {
+            Ok(record) => record,
             Err(error) => {
-                problems.push(problem(&error, &header));
+                problems.push(problem(&error));
                 continue;
             }
         };
-        if let Some(first) = lines.insert(row.view, line) {
-            let what = format!("{} is listed a second time (first on line {first})", row.view);
+        let line = line_of(record.position());
+        let cell = |column: &str| {
+            let position = header.iter().position(|name| name == column)?;
+            record.get(position).filter(|text| !text.is_empty())
+        };
+        let number = match text::whole::<u64>(cell("view").unwrap_or_default()) {
+            Ok(number) => number,
+            Err(what) => {
+                problems.push(Problem::at_line(line, "view", what));
+                continue;
+            }
+        };
+        if let Some(first) = lines.insert(number, line) {
+            let what = format!("{number} is listed a second time (first on line {first})");
             problems.push(Problem::at_line(line, "view", what));
-        } else if let Some(&position) = positions.get(&Label::Number(row.view)) {
-            let set = row.put_on(&mut labelled.raw.views[position]);
-            set.unwrap_or_else(|(column, what)| problems.push(Problem::at_line(line, column, what)));
-        } else {
-            absent += 1;
+            continue;
         }
+        let mut unobserved = View::default();
+        let view = match positions.get(&Label::Number(number)) {
+            Some(&position) => &mut labelled.raw.views[position],
+            None => {
+                absent.push(number.to_string());
+                &mut unobserved
+            }
+        };
+        put_on(view, cell).unwrap_or_else(|(column, what)| problems.push(Problem::at_line(line, column, what)));
     }
     Error::check(&file, problems)?;
-    if lines.is_empty() {
-        return Err(Error::whole(&file, "lists no view"));
+    if lines.len() == absent.len() {
+        return Err(Error::whole(&file, "lists no view that has an observation"));
     }
-    if absent > 0 {
-        labelled.notes.push(format!("{absent} of the {} views of {file} have no observation", lines.len()));
+    if !absent.is_empty() {
+        let more = if absent.len() > MOST_NAMED { ", ..." } else { "" };
+        let named = absent[..absent.len().min(MOST_NAMED)].join(", ");
+        labelled.notes.push(format!(
+            "{} of the {} views of {file} have no observation: {named}{more}",
+            absent.len(),
+            lines.len()
+        ));
     }
     Ok(())
 }
 
-impl Row {
-    /// # Errors
-    /// The column that lacks another, and what it lacks.
-    fn put_on(&self, view: &mut View) -> Result<(), (&'static str, String)> {
-        match (self.width, self.height) {
-            (Some(width_px), Some(height_px)) => view.size = Some(ImageSize { width_px, height_px }),
-            (None, None) => {}
-            (Some(_), None) => return Err(("height", "is empty where a width is given".into())),
-            (None, Some(_)) => return Err(("width", "is empty where a height is given".into())),
-        }
-        match (self.focal_px, self.focal_sigma) {
-            (Some(focal_px), sigma) => {
-                view.focal_prior = Some(FocalPrior { focal_px, sigma_log: sigma.unwrap_or(PRIOR_SIGMA_LOG) });
-            }
-            (None, Some(_)) => return Err(("focal_px", "is empty where a focal_sigma is given".into())),
-            (None, None) => {}
-        }
-        view.camera_group = self.camera_group.unwrap_or(view.camera_group);
-        Ok(())
+/// # Errors
+/// What is wrong with a header.
+fn check(header: &StringRecord) -> Result<(), String> {
+    let known = COLUMNS.join(",");
+    if header.is_empty() {
+        return Err(format!("is empty; a header with columns of `{known}` is needed"));
     }
+    for (position, name) in header.iter().enumerate() {
+        if !COLUMNS.contains(&name) {
+            return Err(format!("{} is no column; there are `{known}`, separated by commas", quote(name)));
+        }
+        if header.iter().take(position).any(|earlier| earlier == name) {
+            return Err(format!("the header names the column `{name}` twice"));
+        }
+    }
+    if header.iter().all(|name| name != "view") { Err("the header has no column `view`".into()) } else { Ok(()) }
+}
+
+/// * `cell`: what a line has in a column; `None`: nothing
+fn put_on<'a>(view: &mut View, cell: impl Fn(&str) -> Option<&'a str>) -> Result<(), Wrong> {
+    let whole = |column: &'static str, least: u32, most: u32| -> Result<Option<u32>, Wrong> {
+        let number = cell(column).map(text::whole::<u32>).transpose().map_err(|what| (column, what))?;
+        match number.filter(|number| !(least..=most).contains(number)) {
+            Some(number) => Err((column, format!("{number} is not within {least}..={most}"))),
+            None => Ok(number),
+        }
+    };
+    let positive = |column: &'static str| -> Result<Option<f64>, Wrong> {
+        let number = cell(column).map(text::number).transpose().map_err(|what| (column, what))?;
+        match number.filter(|number| !(number.is_finite() && *number > 0.0)) {
+            Some(number) => Err((column, format!("{number} is not positive and finite"))),
+            None => Ok(number),
+        }
+    };
+    let side = |column: &'static str| whole(column, 1, ImageSize::MAX_SIDE_PX);
+    match (side("width")?, side("height")?) {
+        (Some(width_px), Some(height_px)) => view.size = Some(ImageSize { width_px, height_px }),
+        (None, None) => {}
+        (Some(_), None) => return Err(("height", "is empty where a width is given".into())),
+        (None, Some(_)) => return Err(("width", "is empty where a height is given".into())),
+    }
+    match (positive("focal_px")?, positive("focal_sigma")?) {
+        (Some(focal_px), sigma) => {
+            view.focal_prior = Some(FocalPrior { focal_px, sigma_log: sigma.unwrap_or(PRIOR_SIGMA_LOG) });
+        }
+        (None, Some(_)) => return Err(("focal_px", "is empty where a focal_sigma is given".into())),
+        (None, None) => {}
+    }
+    view.camera_group = whole("camera_group", 0, u32::MAX)?.unwrap_or(view.camera_group);
+    Ok(())
 }
 
 /// `view,camera_group,width,height`, a line for each view.
@@ -99,14 +145,10 @@ pub fn csv(input: &RawInput) -> String {
     text
 }
 
-/// What the reader of the table says, by line and column.
-fn problem(error: &csv::Error, header: &StringRecord) -> Problem {
+/// What the reader of the table says.
+fn problem(error: &csv::Error) -> Problem {
     let line = line_of(error.position());
     match error.kind() {
-        ErrorKind::Deserialize { err, .. } => {
-            let column = err.field().and_then(|field| header.get(field as usize)).unwrap_or_default();
-            Problem::at_line(line, column, err.kind().to_string())
-        }
         ErrorKind::UnequalLengths { expected_len, len, .. } => {
             Problem::at_line(line, "", format!("{len} fields where the header has {expected_len}"))
         }
@@ -146,24 +188,29 @@ mod tests {
         let base = View { size: size(640, 480), ..View::default() };
         let changed = View { size: size(800, 600), camera_group: 3, ..base.clone() };
         assert_eq!(input.raw.views, [View { focal_prior: prior, ..base.clone() }, base, changed]);
-        assert!(input.notes[0].contains("1 of the 3 views of ") && input.notes[0].ends_with(" have no observation"));
+        assert!(input.notes[0].contains("1 of the 3 views of ") && input.notes[0].ends_with("no observation: 7"));
     }
 
     #[test]
     fn what_is_wrong_is_told_by_line_and_column() {
         for (text, words) in [
-            ("", "lists no view"),
-            ("view,camera_group\n", "lists no view"),
-            ("camera_group\n1\n", "line 2: missing field `view`"),
-            ("view,camera\n2,1\n", "line 2: unknown field `camera`"),
-            ("view,camera_group\n2,-1\n", "line 2: camera_group: invalid digit"),
+            ("", "line 1: is empty; a header"),
+            ("view,camera_group\n", "lists no view that has an observation"),
+            ("view,camera_group\n7,1\n", "lists no view that has an observation"),
+            ("camera_group\n1\n", "line 1: the header has no column `view`"),
+            ("view,camera\n2,1\n", "line 1: `camera` is no column; there are `view,camera_group,"),
+            ("view;camera_group\n2;1\n", "line 1: `view;camera_group` is no column"),
+            ("view,view\n2,2\n", "line 1: the header names the column `view` twice"),
+            ("view,camera_group\n2,-1\n", "line 2: camera_group: `-1` is not a whole number >= 0"),
             ("view,camera_group\n2,1,4\n", "line 2: 3 fields where the header has 2"),
             ("view,camera_group\n2,1\n5,1\n2,1\n", "line 4: view: 2 is listed a second time (first on line 2)"),
             ("view,width,height\n2,800,\n", "line 2: height: is empty"),
             ("view,focal_sigma\n2,0.1\n", "line 2: focal_px: is empty"),
-            ("view,focal_px\n2,NaN\n", "view 2: "),
-            ("view,width,height\n2,0,3\n", "view 2: "),
-            ("view,camera_group\n\u{1}\u{2},1\n", "line 2: view: invalid digit"),
+            ("view,focal_px\n2,NaN\n", "line 2: focal_px: NaN is not positive and finite"),
+            ("view,focal_px,focal_sigma\n7,2,0\n", "line 2: focal_sigma: 0 is not positive and finite"),
+            ("view,width,height\n2,0,3\n", "line 2: width: 0 is not within 1..=1000000"),
+            ("view,camera_group\n\u{1}\u{2},1\n,1\n", "line 2: view: `"),
+            ("view,camera_group\n,1\n", "line 2: view: is empty"),
         ] {
             let refused = with(text).expect_err(text);
             assert!(refused.contains(words), "{text:?}: {refused}");
