@@ -38,9 +38,15 @@ pub(super) fn grade(
     let mut focals = view_focals::of(&best, &sigmas, lenses);
     let determined: Vec<bool> = focals.iter().map(|view| view_focals::is_determined(view, grades)).collect();
     let rival = rival(choice.problem, &best, &others, |view| determined[view]);
-    let differing = (comparison.is_misfit(fit_options) && !has_own_focals)
+    // Of cameras that were taken for one, the tracks that fit are those that projective cameras fit as badly: their
+    // ratio is no misfit, and what they violate the calibration by is. Where it is that alone, views of one camera differ
+    // by some tenths of a per cent too, behind a lens that the model does not quite have: only what the grade depends on
+    // is said.
+    let is_misfit = comparison.is_misfit(fit_options);
+    let differing = ((is_misfit || comparison.is_inflated(fit_options)) && !has_own_focals)
         .then(|| view_focals::differing(&best.minimum.reconstruction, &best.fit, choice))
-        .flatten();
+        .flatten()
+        .filter(|differing| is_misfit || differing.shift > grades.metric_below);
     let grade_group = |group: usize| -> Outcome {
         let mut verdict = Verdict::new(choice.problem.options, warnings.clone());
         // What the ratios of the others' deviations are taken of, and the one that is reported.

@@ -37,6 +37,11 @@ impl Comparison {
         self.ratio > options.rms_ratio_limit && self.is_significant
     }
 
+    /// Whether the data violate the calibration by so much that it is said.
+    pub fn is_inflated(&self, options: &FitOptions) -> bool {
+        self.inflation > options.inflation_limit
+    }
+
     /// The same where all views fit worse than a stretch of them: their noise is taken to be that of the stretch.
     ///
     /// * `all`: the fit of the metric reconstruction to all views, of so many observations that chance explains nothing

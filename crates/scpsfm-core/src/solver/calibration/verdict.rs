@@ -55,7 +55,7 @@ impl<'a> Verdict<'a> {
             );
             self.cap(worst, WarningCode::ModelMismatch, detail);
             self.is_misfit = true;
-        } else if comparison.inflation > options.inflation_limit {
+        } else if comparison.is_inflated(options) {
             let detail = format!(
                 "with {free} free the tracks violate the calibration {:.1} times as much as their noise explains; \
                  sigma is as much larger",
