@@ -1,4 +1,5 @@
-//! Reading and writing a table of views: `view[,camera_group][,width,height][,focal_px[,focal_sigma]]`, one view a line.
+//! Reading and writing a table of views: `view[,camera_group][,width,height][,focal_px[,focal_sigma]]`, one view a
+//! line.
 
 use std::collections::BTreeMap;
 use std::path::Path;
@@ -181,7 +182,8 @@ mod tests {
 
     #[test]
     fn views_get_what_the_table_says_and_keep_the_rest() {
-        let text = "\u{feff}view,width, height,camera_group,focal_px,focal_sigma\r\n9,800,600,3,,\r\n2,,,,700,0.05\r\n7,,,1,,\r\n";
+        let text = "\u{feff}view,width, height,camera_group,focal_px,focal_sigma\r\n\
+                    9,800,600,3,,\r\n2,,,,700,0.05\r\n7,,,1,,\r\n";
         let input = with(text).expect("valid");
         let size = |width_px, height_px| Some(ImageSize { width_px, height_px });
         let prior = Some(FocalPrior { focal_px: 700.0, sigma_log: 0.05 });
@@ -189,6 +191,8 @@ mod tests {
         let changed = View { size: size(800, 600), camera_group: 3, ..base.clone() };
         assert_eq!(input.raw.views, [View { focal_prior: prior, ..base.clone() }, base, changed]);
         assert!(input.notes[0].contains("1 of the 3 views of ") && input.notes[0].ends_with("no observation: 7"));
+        let written = "view,camera_group,width,height\n0,0,640,480\n1,0,640,480\n2,3,800,600\n";
+        assert_eq!(csv(&input.raw), written);
     }
 
     #[test]

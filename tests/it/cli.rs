@@ -563,3 +563,18 @@ fn submit_says_that_it_waits_for_a_server_that_drains_and_why() {
         format!("waiting up to 30 s: {}: the server is draining; try another or come back\n", serving.grpc)
     );
 }
+
+#[test]
+fn a_table_of_views_is_not_replaced_by_the_result() {
+    let directory = directory();
+    let path = |name: &str| directory.path().join(name).to_str().expect("a path of ours").to_owned();
+    let made = run(["synth", "--views", "4", "--tracks", "30", "--out", &path("scene")]);
+    assert_eq!(made.code, Some(0), "{made:?}");
+    let table = path("out/tracks.csv");
+    fs::create_dir(path("out")).expect("created");
+    fs::copy(path("scene/views.csv"), &table).expect("copied");
+    let refused = run(["solve", &path("scene/observations.csv"), "--view-table", &table, "--out", &path("out")]);
+    assert_eq!(refused.code, Some(2), "{refused:?}");
+    assert!(refused.stderr.contains("would replace its own input") && refused.stderr.contains(&table), "{refused:?}");
+    assert_eq!(fs::read(table).expect("kept"), fs::read(path("scene/views.csv")).expect("a table"));
+}

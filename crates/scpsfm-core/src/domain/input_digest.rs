@@ -6,8 +6,9 @@ use super::{RawInput, Sha256Digest};
 
 impl RawInput {
     /// SHA-256 of what the whole input says, observations in the caller's order, as the API's
-    /// `JobResult.input_content_sha256` lays it out. No part can be taken for another: all are of a fixed length but names, whose length goes before them, and
-    /// 0, which stands for what is left out, is no valid size, focal length, sigma or depth.
+    /// `JobResult.input_content_sha256` lays it out. No part can be taken for another: all are of a fixed length but
+    /// names, whose length goes before them, and 0, which stands for what is left out, is no valid size, focal length,
+    /// sigma or depth.
     pub fn sha256(&self) -> Sha256Digest {
         let mut hash = Sha256::new();
         let count = |count: usize| (count as u64).to_le_bytes();

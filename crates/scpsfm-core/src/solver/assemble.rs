@@ -173,9 +173,9 @@ impl Reconstruction {
         }
     }
 
-    /// The calibration of each camera group with registered views in pixels, its principal point about the image centre of the group's first
-    /// view; where views have their own focal lengths, with the geometric mean of the group's, or of all for one of
-    /// which none is determined.
+    /// The calibration of each camera group with registered views in pixels, its principal point about the image centre
+    /// of the group's first view; where views have their own focal lengths, with the geometric mean of the group's, or
+    /// of all for one of which none is determined.
     fn calibrations(&self, problem: &Problem) -> Vec<Calibration> {
         if !self.is_metric() {
             return Vec::new();
@@ -187,9 +187,9 @@ impl Reconstruction {
         };
         let determined: Vec<usize> = (0..self.poses.len()).filter(|&view| self.poses[view].is_some()).collect();
         let of_group = |group: usize| {
-            let view = group_of.iter().position(|of| *of == group)?;
-            let is_registered = |view: usize| group_of[view] == group && self.geometry.cameras[view].is_some();
-            (0..group_of.len()).any(is_registered).then_some(())?;
+            let views = || (0..group_of.len()).filter(|&view| group_of[view] == group);
+            let view = views().next()?;
+            views().find(|&view| self.geometry.cameras[view].is_some())?;
             let (intrinsics, outcome) = &self.calibrated[problem.camera_of[view]];
             let intrinsics = (*intrinsics)?;
             if !problem.has_own_focals() {

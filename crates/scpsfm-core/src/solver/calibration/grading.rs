@@ -39,9 +39,9 @@ pub(super) fn grade(
     let determined: Vec<bool> = focals.iter().map(|view| view_focals::is_determined(view, grades)).collect();
     let rival = rival(choice.problem, &best, &others, |view| determined[view]);
     // Of cameras that were taken for one, the tracks that fit are those that projective cameras fit as badly: their
-    // ratio is no misfit, and what they violate the calibration by is. Where it is that alone, views of one camera differ
-    // by some tenths of a per cent too, behind a lens that the model does not quite have: only what the grade depends on
-    // is said.
+    // ratio is no misfit, and what they violate the calibration by is. Where it is that alone, views of one camera
+    // differ by some tenths of a per cent too, behind a lens that the model does not quite have: only what the grade
+    // depends on is said.
     let is_misfit = comparison.is_misfit(fit_options);
     let differing = ((is_misfit || comparison.is_inflated(fit_options)) && !has_own_focals)
         .then(|| view_focals::differing(&best.minimum.reconstruction, &best.fit, choice))
