@@ -3,6 +3,8 @@
 use burn_tensor::{Device, Tensor, TensorData};
 use serde::{Deserialize, Serialize};
 
+use crate::simd::vectorised;
+
 /// Decay of the mean of gradients (Kingma & Ba 2015, algorithm 1).
 const BETA_1: f32 = 0.9;
 /// Decay of the mean of squared gradients (same source).
@@ -72,17 +74,23 @@ impl Parameter {
         let correction = (1.0 - BETA_2.powi(self.steps)).sqrt();
         let rate = learning_rate * correction / (1.0 - BETA_1.powi(self.steps));
         let epsilon = EPSILON * correction;
-        let mut replaced = 0;
-        let state = self.values.iter_mut().zip(&mut self.mean).zip(&mut self.mean_square);
-        for (((value, mean), mean_square), &gradient) in state.zip(gradient) {
-            let finite = gradient.is_finite();
-            replaced += u64::from(!finite);
-            let gradient = if finite { gradient.clamp(-MAX_GRADIENT, MAX_GRADIENT) } else { 0.0 };
-            *mean = BETA_1 * *mean + (1.0 - BETA_1) * gradient;
-            *mean_square = BETA_2 * *mean_square + (1.0 - BETA_2) * gradient * gradient;
-            *value -= rate * *mean / (mean_square.sqrt() + epsilon);
-        }
-        replaced
+        let Self { values, mean, mean_square, .. } = self;
+        vectorised(
+            #[inline(always)]
+            move || {
+                let mut replaced = 0u32;
+                let state = values.iter_mut().zip(mean).zip(mean_square);
+                for (((value, mean), mean_square), &gradient) in state.zip(gradient) {
+                    let finite = gradient.is_finite();
+                    replaced += u32::from(!finite);
+                    let gradient = if finite { gradient.clamp(-MAX_GRADIENT, MAX_GRADIENT) } else { 0.0 };
+                    *mean = BETA_1 * *mean + (1.0 - BETA_1) * gradient;
+                    *mean_square = BETA_2 * *mean_square + (1.0 - BETA_2) * gradient * gradient;
+                    *value -= rate * *mean / (mean_square.sqrt() + epsilon);
+                }
+                u64::from(replaced)
+            },
+        )
     }
 }
 

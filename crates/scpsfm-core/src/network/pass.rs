@@ -286,11 +286,13 @@ impl Layer<Parameter> {
     }
 
     fn statistics(&self, response: &[f32], columns: usize) -> Statistics {
-        let deviation: Vec<f32> = vectorised(
+        let mut deviation = vec![0.0; response.len() / columns];
+        vectorised(
             #[inline(always)]
             || {
-                let variance = |row: &[f32]| dot(row, row) / columns as f32;
-                response.chunks_exact(columns).map(|row| (variance(row) + VARIANCE_FLOOR).sqrt()).collect()
+                for (deviation, row) in deviation.iter_mut().zip(response.chunks_exact(columns)) {
+                    *deviation = (dot(row, row) / columns as f32 + VARIANCE_FLOOR).sqrt();
+                }
             },
         );
         let scale = match &self.gain {
