@@ -104,35 +104,36 @@ fn check(header: &StringRecord) -> Result<(), String> {
 
 /// * `cell`: what a line has in a column; `None`: nothing
 fn put_on<'a>(view: &mut View, cell: impl Fn(&str) -> Option<&'a str>) -> Result<(), Wrong> {
-    let whole = |column: &'static str, least: u32, most: u32| -> Result<Option<u32>, Wrong> {
+    let whole = |column: &'static str, (least, most): (u32, u32)| -> Result<Option<u32>, Wrong> {
         let number = cell(column).map(text::whole::<u32>).transpose().map_err(|what| (column, what))?;
         match number.filter(|number| !(least..=most).contains(number)) {
             Some(number) => Err((column, format!("{number} is not within {least}..={most}"))),
             None => Ok(number),
         }
     };
-    let positive = |column: &'static str| -> Result<Option<f64>, Wrong> {
+    let real = |column: &'static str, (least, most): (f64, f64)| -> Result<Option<f64>, Wrong> {
         let number = cell(column).map(text::number).transpose().map_err(|what| (column, what))?;
-        match number.filter(|number| !(number.is_finite() && *number > 0.0)) {
-            Some(number) => Err((column, format!("{number} is not positive and finite"))),
+        match number.filter(|number| !(least..=most).contains(number)) {
+            Some(number) => Err((column, format!("{number} is not within {least:e}..={most:e}"))),
             None => Ok(number),
         }
     };
-    let side = |column: &'static str| whole(column, 1, ImageSize::MAX_SIDE_PX);
+    let side = |column: &'static str| whole(column, (1, ImageSize::MAX_SIDE_PX));
     match (side("width")?, side("height")?) {
         (Some(width_px), Some(height_px)) => view.size = Some(ImageSize { width_px, height_px }),
         (None, None) => {}
         (Some(_), None) => return Err(("height", "is empty where a width is given".into())),
         (None, Some(_)) => return Err(("width", "is empty where a height is given".into())),
     }
-    match (positive("focal_px")?, positive("focal_sigma")?) {
+    let sigma_log = real("focal_sigma", FocalPrior::SIGMA_LOG_RANGE)?;
+    match (real("focal_px", FocalPrior::FOCAL_RANGE_PX)?, sigma_log) {
         (Some(focal_px), sigma) => {
             view.focal_prior = Some(FocalPrior { focal_px, sigma_log: sigma.unwrap_or(PRIOR_SIGMA_LOG) });
         }
         (None, Some(_)) => return Err(("focal_px", "is empty where a focal_sigma is given".into())),
         (None, None) => {}
     }
-    view.camera_group = whole("camera_group", 0, u32::MAX)?.unwrap_or(view.camera_group);
+    view.camera_group = whole("camera_group", (0, u32::MAX))?.unwrap_or(view.camera_group);
     Ok(())
 }
 
@@ -210,8 +211,9 @@ mod tests {
             ("view,camera_group\n2,1\n5,1\n2,1\n", "line 4: view: 2 is listed a second time (first on line 2)"),
             ("view,width,height\n2,800,\n", "line 2: height: is empty"),
             ("view,focal_sigma\n2,0.1\n", "line 2: focal_px: is empty"),
-            ("view,focal_px\n2,NaN\n", "line 2: focal_px: NaN is not positive and finite"),
-            ("view,focal_px,focal_sigma\n7,2,0\n", "line 2: focal_sigma: 0 is not positive and finite"),
+            ("view,focal_px\n2,NaN\n", "line 2: focal_px: NaN is not within 1e-6..=1e9"),
+            ("view,focal_px\n2,1e300\n", "line 2: focal_px: 1"),
+            ("view,focal_px,focal_sigma\n7,2,0\n", "line 2: focal_sigma: 0 is not within 1e-9..=1e3"),
             ("view,width,height\n2,0,3\n", "line 2: width: 0 is not within 1..=1000000"),
             ("view,camera_group\n\u{1}\u{2},1\n,1\n", "line 2: view: `"),
             ("view,camera_group\n,1\n", "line 2: view: is empty"),

@@ -22,7 +22,7 @@ pub fn warning(code: WarningCode) -> &'static str {
         }
         WarningCode::SecondMinimum => "Another calibration explains the tracks about as well as the one shown.",
         WarningCode::ModelMismatch => {
-            "One constant, distortion-free camera fits notably worse than free cameras do: expect lens distortion, a zoom or a displaced principal point."
+            "The cameras are not what the calibration takes them to be: expect several cameras, a zoom, a lens that no model here describes, or focal lengths that were given wrong."
         }
         WarningCode::FewInliers => "So few tracks agree that the result can hardly be verified.",
         WarningCode::PrincipalPointUnobservable => {

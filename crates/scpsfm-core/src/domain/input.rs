@@ -28,6 +28,14 @@ pub struct FocalPrior {
     pub sigma_log: f64,
 }
 
+impl FocalPrior {
+    /// Beyond are mistakes of the unit: a pixel of a millionth, and a field of view of a thousandth of a radian in the
+    /// [largest](ImageSize::MAX_SIDE_PX) of images.
+    pub const FOCAL_RANGE_PX: (f64, f64) = (1e-6, 1e9);
+    /// From what no calibration reaches to what says nothing.
+    pub const SIGMA_LOG_RANGE: (f64, f64) = (1e-9, 1e3);
+}
+
 /// One image.
 #[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
 pub struct View {
@@ -343,10 +351,16 @@ fn check_views(views: &[View], field: &impl Fn(&str) -> String, found: &mut Viol
             }
         }
         if let Some(FocalPrior { focal_px, sigma_log }) = view.focal_prior {
-            for (part, value) in [("focal_prior.focal_px", focal_px), ("focal_prior.sigma_log", sigma_log)] {
-                if !(value.is_finite() && value > 0.0) {
-                    let description =
-                        format!("focal prior {focal_px} px with sigma {sigma_log} is not positive and finite");
+            let parts = [
+                ("focal_prior.focal_px", focal_px, FocalPrior::FOCAL_RANGE_PX),
+                ("focal_prior.sigma_log", sigma_log, FocalPrior::SIGMA_LOG_RANGE),
+            ];
+            for (part, value, (least, most)) in parts {
+                // Written so that NaN fails.
+                if !(least..=most).contains(&value) {
+                    let description = format!(
+                        "focal prior {focal_px} px with sigma {sigma_log}: {value} is not within {least:e}..={most:e}"
+                    );
                     found.push(Violation::at(field("views"), index, description).within(part));
                 }
             }
@@ -508,6 +522,18 @@ pub(super) mod tests {
         assert_eq!(with(&|raw| raw.views.truncate(1)), ["track_set.views"]);
         let half_a_size = View { size: Some(ImageSize { width_px: 640, height_px: 0 }), ..View::default() };
         assert_eq!(with(&|raw| raw.views[1] = half_a_size.clone()), ["track_set.views[1].size.height_px"]);
+        for (focal_px, sigma_log, fields) in [
+            (1e300, 0.1, vec!["track_set.views[0].focal_prior.focal_px"]),
+            (800.0, 1e-200, vec!["track_set.views[0].focal_prior.sigma_log"]),
+            (
+                f64::NAN,
+                0.0,
+                vec!["track_set.views[0].focal_prior.focal_px", "track_set.views[0].focal_prior.sigma_log"],
+            ),
+        ] {
+            let focal_prior = Some(FocalPrior { focal_px, sigma_log });
+            assert_eq!(with(&|raw| raw.views[0].focal_prior = focal_prior), fields, "{focal_px} {sigma_log}");
+        }
         assert_eq!(
             with(&|raw| raw.view = vec![0, 0, 0, 0]),
             ["track_set.track_indices[3]", "track_set.track_indices[1]", "track_set.view_indices"]

@@ -19,7 +19,8 @@ pub enum WarningCode {
     UnobservableFocal,
     /// Another calibration explains the data about as well.
     SecondMinimum,
-    /// The metric model fits notably worse than the projective one: distortion, a zoom, a wrong principal point.
+    /// The metric model fits notably worse than the projective one (distortion, a zoom, a wrong principal point), or
+    /// focal lengths known beforehand contradict the tracks or each other.
     ModelMismatch,
     /// Too few inlier tracks to verify or to calibrate.
     FewInliers,
