@@ -17,12 +17,14 @@ pub enum SweepArg {
     Views,
     /// Noise, 3 to 11 % (the supplement)
     StrongNoise,
-    /// Rotations to 3.1 rad, .5 to .95 outliers
+    /// Rotations to 3.1 rad, .5 to .97 outliers
     Orbit,
     /// Uniform, slid, repeated outliers, a second motion
     Structured,
     /// Outliers that are wrong in 1, 2, 5 of 10 views
     Partial,
+    /// Noise, 1 to 5 %, of 8 right tracks among 200
+    NoiseOfFew,
     /// Noise that is not Gaussian
     NoiseKind,
     /// Critical motions and a planar scene

@@ -25,6 +25,8 @@ const SWEEP_OUTLIERS: f64 = 0.9;
 /// Outlier share of scenes that are hard for another reason.
 const FEW_OUTLIERS: f64 = 0.3;
 const HALF_OUTLIERS: f64 = 0.5;
+/// Of 200 tracks 8 are right.
+const FEW_RIGHT_OUTLIERS: f64 = 0.96;
 /// Rotations of an orbit: nearly all the way round, about each axis.
 const ORBIT_RAD: f64 = 3.1;
 
@@ -54,7 +56,7 @@ impl Sweep {
             Self::over("noise", "noise, share of the width", &[0.001, 0.003, 0.006, 0.01, 0.02], noise),
             Self::over("views", "views n", &[5.0, 10.0, 20.0, 50.0, 100.0], views),
             Self::over("strong-noise", "noise, share of the width", &[0.03, 0.05, 0.07, 0.09, 0.11], noise),
-            Self::over("orbit", "share of outliers", &[0.5, 0.8, 0.9, 0.95], orbit),
+            Self::over("orbit", "share of outliers", &[0.5, 0.8, 0.9, 0.95, 0.97], orbit),
         ]
     }
 
@@ -64,6 +66,7 @@ impl Sweep {
         let half = SceneOptions { outliers: HALF_OUTLIERS, ..SceneOptions::default() };
         let kind = |outlier_kind| SceneOptions { outlier_kind, ..half.clone() };
         let wrong = |wrong_views| SceneOptions { wrong_views, ..half.clone() };
+        let of_few = |noise| SceneOptions { noise, outliers: FEW_RIGHT_OUTLIERS, ..SceneOptions::default() };
         let noise = |noise_kind| SceneOptions { noise_kind, outliers: SWEEP_OUTLIERS, ..SceneOptions::default() };
         let motion = |motion| SceneOptions { motion, ..few.clone() };
         let displaced = |share| SceneOptions { principal_point: [share, -share], ..half.clone() };
@@ -86,6 +89,7 @@ impl Sweep {
                 "wrong views of an outlier",
                 vec![("1-wrong", wrong(1)), ("2-wrong", wrong(2)), ("5-wrong", wrong(5))],
             ),
+            Self::over("noise-of-few", "noise, share of the width", &[0.01, 0.03, 0.05], of_few),
             Self::named(
                 "noise-kind",
                 "distribution of the noise",

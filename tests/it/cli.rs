@@ -95,18 +95,18 @@ fn an_evaluation_scores_methods_against_the_oracle_and_goes_on_where_it_was() {
     };
     let summary = evaluate("1");
     let cells = summary["cells"].as_array().expect("cells");
-    assert_eq!(cells.len(), 8, "four shares of outliers, two methods");
+    assert_eq!(cells.len(), 10, "five shares of outliers, two methods");
     let oracle = cells.iter().filter(|cell| cell["contestant"] == "oracle");
-    assert!(oracle.clone().count() == 4 && oracle.clone().all(|cell| cell["mean_f1"].as_f64() > Some(0.95)));
+    assert!(oracle.clone().count() == 5 && oracle.clone().all(|cell| cell["mean_f1"].as_f64() > Some(0.95)));
     for file in ["runs.jsonl", "summary.json", "summary.csv", "figure-depths-given.svg", "index.html"] {
         assert!(out.join(file).metadata().is_ok_and(|metadata| metadata.len() > 0), "{file}");
     }
     let records = || fs::read_to_string(out.join("runs.jsonl")).expect("records");
     let first = records();
-    assert_eq!(first.lines().count(), 1 + 8);
+    assert_eq!(first.lines().count(), 1 + 10);
     evaluate("2");
     assert!(records().starts_with(&first), "what was recorded stays");
-    assert_eq!(records().lines().count(), 1 + 16);
+    assert_eq!(records().lines().count(), 1 + 20);
 }
 
 #[test]
