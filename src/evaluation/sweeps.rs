@@ -26,7 +26,7 @@ const SWEEP_OUTLIERS: f64 = 0.9;
 const FEW_OUTLIERS: f64 = 0.3;
 const HALF_OUTLIERS: f64 = 0.5;
 /// Of 200 tracks 8 are right.
-const FEW_RIGHT_OUTLIERS: f64 = 0.96;
+const EIGHT_RIGHT_OUTLIERS: f64 = 0.96;
 /// Rotations of an orbit: nearly all the way round, about each axis.
 const ORBIT_RAD: f64 = 3.1;
 
@@ -66,7 +66,7 @@ impl Sweep {
         let half = SceneOptions { outliers: HALF_OUTLIERS, ..SceneOptions::default() };
         let kind = |outlier_kind| SceneOptions { outlier_kind, ..half.clone() };
         let wrong = |wrong_views| SceneOptions { wrong_views, ..half.clone() };
-        let of_few = |noise| SceneOptions { noise, outliers: FEW_RIGHT_OUTLIERS, ..SceneOptions::default() };
+        let of_few = |noise| SceneOptions { noise, outliers: EIGHT_RIGHT_OUTLIERS, ..SceneOptions::default() };
         let noise = |noise_kind| SceneOptions { noise_kind, outliers: SWEEP_OUTLIERS, ..SceneOptions::default() };
         let motion = |motion| SceneOptions { motion, ..few.clone() };
         let displaced = |share| SceneOptions { principal_point: [share, -share], ..half.clone() };

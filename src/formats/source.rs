@@ -232,7 +232,7 @@ mod tests {
         let input = with(800.0).expect("valid");
         assert!(input.raw.views.iter().all(|view| view.focal_prior == Some(prior(800.0))));
         let refused = with(-1.0).expect_err("no focal length").to_string();
-        assert!(refused.contains("focal prior -1 px with sigma 0.1: -1 is not within 1e-6..=1e9"), "{refused}");
+        assert!(refused.contains("focal prior -1e0 px with sigma 1e-1: -1e0 is not within 1e-6..=1e9"), "{refused}");
     }
 
     #[test]

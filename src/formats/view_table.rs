@@ -114,7 +114,7 @@ fn put_on<'a>(view: &mut View, cell: impl Fn(&str) -> Option<&'a str>) -> Result
     let real = |column: &'static str, (least, most): (f64, f64)| -> Result<Option<f64>, Wrong> {
         let number = cell(column).map(text::number).transpose().map_err(|what| (column, what))?;
         match number.filter(|number| !(least..=most).contains(number)) {
-            Some(number) => Err((column, format!("{number} is not within {least:e}..={most:e}"))),
+            Some(number) => Err((column, format!("{number:e} is not within {least:e}..={most:e}"))),
             None => Ok(number),
         }
     };
@@ -212,8 +212,8 @@ mod tests {
             ("view,width,height\n2,800,\n", "line 2: height: is empty"),
             ("view,focal_sigma\n2,0.1\n", "line 2: focal_px: is empty"),
             ("view,focal_px\n2,NaN\n", "line 2: focal_px: NaN is not within 1e-6..=1e9"),
-            ("view,focal_px\n2,1e300\n", "line 2: focal_px: 1"),
-            ("view,focal_px,focal_sigma\n7,2,0\n", "line 2: focal_sigma: 0 is not within 1e-9..=1e3"),
+            ("view,focal_px\n2,1e300\n", "line 2: focal_px: 1e300 is not within 1e-6..=1e9"),
+            ("view,focal_px,focal_sigma\n7,2,0\n", "line 2: focal_sigma: 0e0 is not within 1e-9..=1e3"),
             ("view,width,height\n2,0,3\n", "line 2: width: 0 is not within 1..=1000000"),
             ("view,camera_group\n\u{1}\u{2},1\n,1\n", "line 2: view: `"),
             ("view,camera_group\n,1\n", "line 2: view: is empty"),

@@ -29,10 +29,10 @@ pub struct FocalPrior {
 }
 
 impl FocalPrior {
-    /// Beyond are mistakes of the unit: a pixel of a millionth, and a field of view of a thousandth of a radian in the
-    /// [largest](ImageSize::MAX_SIDE_PX) of images.
+    /// Values outside are mistakes of the unit: the largest is a field of view of a thousandth of a radian in the
+    /// [largest](ImageSize::MAX_SIDE_PX) image.
     pub const FOCAL_RANGE_PX: (f64, f64) = (1e-6, 1e9);
-    /// From what no calibration reaches to what says nothing.
+    /// A smaller value is finer than any calibration, a larger one says nothing.
     pub const SIGMA_LOG_RANGE: (f64, f64) = (1e-9, 1e3);
 }
 
@@ -359,7 +359,7 @@ fn check_views(views: &[View], field: &impl Fn(&str) -> String, found: &mut Viol
                 // Written so that NaN fails.
                 if !(least..=most).contains(&value) {
                     let description = format!(
-                        "focal prior {focal_px} px with sigma {sigma_log}: {value} is not within {least:e}..={most:e}"
+                        "focal prior {focal_px:e} px with sigma {sigma_log:e}: {value:e} is not within {least:e}..={most:e}"
                     );
                     found.push(Violation::at(field("views"), index, description).within(part));
                 }

@@ -11,14 +11,14 @@ use super::calibration::{self, Outcome};
 use super::classification::Judged;
 use super::depths::{self, DepthOptions, TrackWeights};
 use super::fusion::Estimate;
-use super::grow::{self, LEAST_INLIERS};
+use super::grow::{self, Consensus, LEAST_INLIERS};
 use super::learned::TrackScores;
 use super::portfolio::{self, Found, Portfolio, VerifiedBy};
 use super::problem::Problem;
 use super::recorder::Recorder;
 use super::sequence::ProjectiveReconstruction;
 use super::{Error, all_tracks, near_duplicates, scpsfm, static_tracks, track_sampling};
-use crate::domain::{FocalPrior, Grade, Method, Stage, WarningCode};
+use crate::domain::{FocalPrior, Grade, Method, Proposal, Stage, WarningCode};
 use crate::geometry::bundle::metric::{Intrinsics, MetricReconstruction};
 use crate::geometry::statistics::median;
 
@@ -304,9 +304,7 @@ fn search(
     let Some(consensus) = attempt.found.consensus.take() else { return Ok(attempt) };
     recorder.enter(Stage::Refine);
     if matches!(attempt.found.verified_by, VerifiedBy::Depths { .. }) {
-        attempt.weights_by_depths = depths::weights(problem, &attempt.block, &consensus, &attempt.found.rigid);
-        attempt.found.consensus = Some(consensus);
-        return Ok(attempt);
+        return Ok(verified_by_depths(problem, attempt, consensus));
     }
     let (mut refined, ln_false_alarms) = grow::refine(complete, &consensus, portfolio::spread(complete), problem.stop);
     recorder.hypothesis.inliers = refined.inlier_count() as u32;
@@ -319,11 +317,11 @@ fn search(
     if counted < LEAST_INLIERS {
         attempt.found.rejected_by_network =
             (counted < refined.inlier_count()).then_some((refined.inlier_count(), counted));
-        return Ok(attempt);
+        return Ok(by_depths(problem, attempt));
     }
     // Another noise and other inliers than those that were accepted.
     if ln_false_alarms >= FalseAlarmOptions::DEFAULT.ln_acceptable {
-        return Ok(attempt);
+        return Ok(by_depths(problem, attempt));
     }
     if effort.is_seed {
         attempt.found.consensus = Some(refined);
@@ -342,6 +340,22 @@ fn search(
     }
     attempt.found.consensus = Some(refined);
     Ok(attempt)
+}
+
+/// The rigid consensus of an attempt whose image points verify nothing; the attempt as it is where there is none.
+fn by_depths(problem: &Problem, mut attempt: Attempt) -> Attempt {
+    let Some(rigid) = &attempt.found.rigid else { return attempt };
+    let consensus = depths::consensus(&attempt.block.complete, rigid, problem.initial_noise);
+    attempt.found.verified_by = VerifiedBy::Depths { focal: rigid.focal };
+    attempt.found.winning_proposal = Some(Proposal::Rigidity);
+    attempt.found.rejected_by_network = None;
+    verified_by_depths(problem, attempt, consensus)
+}
+
+fn verified_by_depths(problem: &Problem, mut attempt: Attempt, consensus: Consensus) -> Attempt {
+    attempt.weights_by_depths = depths::weights(problem, &attempt.block, &consensus, &attempt.found.rigid);
+    attempt.found.consensus = Some(consensus);
+    attempt
 }
 
 /// The network's weights of the searched tracks, for a larger block; 0 for tracks that it was not shown.

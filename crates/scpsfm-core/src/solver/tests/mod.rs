@@ -115,6 +115,19 @@ fn strong_noise_is_judged_by_depths_too() {
     assert!(by_depths > 0.9 && by_depths > by_image, "mean F1 {by_depths} with depths, {by_image} without");
 }
 
+/// Once their noise is measured, image points hold fewer tracks than verify anything.
+#[test]
+fn depths_stand_where_image_points_hold_too_few_tracks() {
+    for seed in [10_002, 10_018] {
+        let options = SceneOptions { outliers: 0.96, noise: 0.01, with_depths: true, seed, ..SceneOptions::default() };
+        let (input, scene) = scene(options);
+        let solution = solved(&input, &SolveSettings::default());
+        assert_eq!(solution.tracks.inlier, scene.truth.inlier, "seed {seed}");
+        assert_eq!(solution.winning_proposal, Some(Proposal::Rigidity), "seed {seed}");
+        assert!(matches!(solution.grade, Some(Grade::Weak | Grade::ProjectiveOnly)), "seed {seed}");
+    }
+}
+
 #[test]
 fn padding_changes_nothing() {
     // The paper pads its matrices to 300 x 1000.
