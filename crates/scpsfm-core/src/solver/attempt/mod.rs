@@ -96,14 +96,24 @@ impl Attempt {
         matches!(self.found.verified_by, VerifiedBy::ImagePoints) && self.decided.is_none()
     }
 
+    /// Whether depths verify it.
+    pub fn is_by_depths(&self) -> bool {
+        matches!(self.found.verified_by, VerifiedBy::Depths { .. })
+    }
+
+    /// Whether depths verify it, so that what image points alone say at a noise this strong (normalised units) is worth
+    /// less: hundreds of tracks fit some plane then.
+    pub fn outweighs_image_points_at(&self, noise: f64) -> bool {
+        self.is_by_depths() && noise > DepthOptions::DEFAULT.strong_noise
+    }
+
     /// Whether depths verify it, in noise so strong that image points verify nothing beside them. False for fewer than
     /// [`LEAST_INLIERS`] tracks, whose residuals do not tell noise from wrong observations, and for mixed residuals.
     pub fn is_beyond_image_points(&self) -> bool {
-        let by_depths = matches!(self.found.verified_by, VerifiedBy::Depths { .. });
         let is_noisy = |found: &ProjectiveReconstruction| {
-            found.noise > DepthOptions::DEFAULT.strong_noise && found.tracks.len() >= LEAST_INLIERS
+            self.outweighs_image_points_at(found.noise) && found.tracks.len() >= LEAST_INLIERS
         };
-        by_depths && self.projective.as_ref().is_some_and(is_noisy) && !self.has_mixed_residuals()
+        self.projective.as_ref().is_some_and(is_noisy) && !self.has_mixed_residuals()
     }
 
     /// Whether the residuals are of several kinds, most small and some large: tracks that hold wrong observations were
@@ -116,7 +126,7 @@ impl Attempt {
 
     /// Says that image points verify what it was extended to, whatever verified the seed.
     pub fn verified_by_image_points(&mut self) {
-        if matches!(self.found.verified_by, VerifiedBy::Depths { .. }) {
+        if self.is_by_depths() {
             self.found.verified_by = VerifiedBy::ImagePoints;
             self.weights_by_depths = None;
         }
@@ -303,7 +313,7 @@ fn search(
     problem.stopped()?;
     let Some(consensus) = attempt.found.consensus.take() else { return Ok(attempt) };
     recorder.enter(Stage::Refine);
-    if matches!(attempt.found.verified_by, VerifiedBy::Depths { .. }) {
+    if attempt.is_by_depths() {
         return Ok(verified_by_depths(problem, attempt, consensus));
     }
     let (mut refined, ln_false_alarms) = grow::refine(complete, &consensus, portfolio::spread(complete), problem.stop);

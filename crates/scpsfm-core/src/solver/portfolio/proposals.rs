@@ -38,22 +38,43 @@ impl Portfolio<'_> {
         stats.seconds += begun.elapsed().as_secs_f64();
         stats.work += pairs as u32;
         let Some(rigid) = found else { return };
-        self.verify(Proposal::Rigidity, vec![depths::seed(&rigid)]);
+        self.offer_rigid(Proposal::Rigidity, rigid, search.spread());
+    }
+
+    /// A rigid consensus, grown by image points, and as depths verify it where that is not decisive.
+    ///
+    /// * `spread`: of the search that found it
+    fn offer_rigid(&mut self, proposal: Proposal, rigid: rigid::Rigid, spread: f64) {
+        self.verify(proposal, vec![depths::seed(&rigid)]);
         if !self.is_decisive() {
             let found = Best {
-                ln_false_alarms: rigid.ln_false_alarms(search.spread()),
+                ln_false_alarms: rigid.ln_false_alarms(spread),
                 verified_by: VerifiedBy::Depths { focal: rigid.focal },
                 consensus: depths::consensus(self.block, &rigid, self.noise),
                 counted: rigid.inlier_count(),
-                proposal: Proposal::Rigidity,
+                proposal,
             };
-            self.stats(Proposal::Rigidity).record(&found);
+            self.stats(proposal).record(&found);
             self.offer(found);
         }
-        let certainty = |rigid: &rigid::Rigid| rigid.ln_false_alarms(search.spread());
+        let certainty = |rigid: &rigid::Rigid| rigid.ln_false_alarms(spread);
         let least = self.rigid.as_ref().map_or(FalseAlarmOptions::DEFAULT.ln_decisive, certainty);
         if certainty(&rigid) < least {
             self.rigid = Some(rigid);
+        }
+    }
+
+    /// A rigid consensus around tracks that a proposal keeps.
+    fn propose_rigid_around(&mut self, proposal: Proposal, kept: &[usize]) {
+        if self.settings.focal_per_view || !self.is_wanted(proposal) {
+            return;
+        }
+        let Some(search) = rigid::RigidSearch::new(self.block, self.spread, self.stop) else { return };
+        let begun = Instant::now();
+        let found = search.around(kept, self.noise);
+        self.stats(proposal).seconds += begun.elapsed().as_secs_f64();
+        if let Some(rigid) = found {
+            self.offer_rigid(proposal, rigid, search.spread());
         }
     }
 
@@ -163,11 +184,12 @@ impl Portfolio<'_> {
         let kept: Vec<usize> = (0..weights.len()).filter(|&track| weights[track] > THRESHOLD).collect();
         let seed = match &self.search {
             _ if kept.len() < RANK => None,
-            Search::Affine(_) => affine::seed(self.block, kept),
+            Search::Affine(_) => affine::seed(self.block, kept.clone()),
             Search::Subspace(search) => dominant_subspace(&search.balanced().select_columns(&kept), RANK)
                 .map(|basis| search.seed(self.block, &basis)),
         };
         self.verify(Proposal::Network, seed.into_iter().collect());
+        self.propose_rigid_around(Proposal::Network, &kept);
         self.propose(Proposal::Network, &priors::from_network(weights), None);
     }
 

@@ -385,7 +385,9 @@ fn by_projective_extension(
             let grown = attempt.evidence(problem) / best.evidence(problem);
             is_part && grown < ExtensionOptions::DEFAULT.least_evidence_growth
         };
-        if best.as_ref().is_some_and(is_known) {
+        let noise = attempt.projective.as_ref().map_or(0.0, |found| found.noise);
+        let is_outweighed = |best: &Attempt| !attempt.is_by_depths() && best.outweighs_image_points_at(noise);
+        if best.as_ref().is_some_and(|best| is_known(best) || is_outweighed(best)) {
             continue;
         }
         attempt::calibrate(problem, &mut attempt, &[], recorder)?;
@@ -410,6 +412,9 @@ fn metric_of(problem: &Problem, attempt: Attempt, recorder: &mut Recorder) -> Re
     }
     let was_calibrated = attempt.is_calibrated();
     let mut extended = extend(problem, attempt, recorder)?;
+    if extended.seed.outweighs_image_points_at(extended.model.noise) {
+        return Ok(Ended::Block(Some(Box::new(extended.seed))));
+    }
     let explains_more = || extended.evidence(problem) > extended.seed.evidence(problem);
     // One that takes a calibration back stands in any case: the seed would go on giving it.
     if extended.stands() && (was_calibrated || extended.is_calibrated(problem) || explains_more()) {
@@ -471,7 +476,8 @@ fn extend_projectively(
         options = GrowthOptions { gives_points: false, adjust_growth: f64::INFINITY, final_rounds: 1, ..options };
     }
     let extended = projective_growth::extend(problem, start, &options, recorder)?;
-    if extended.views.len() >= view_selection::LEAST_VIEWS && extended.tracks.len() >= least {
+    let is_outweighed = attempt.outweighs_image_points_at(extended.noise);
+    if extended.views.len() >= view_selection::LEAST_VIEWS && extended.tracks.len() >= least && !is_outweighed {
         attempt.projective = Some(extended);
         attempt.verified_by_image_points();
     } else if before.is_some() {

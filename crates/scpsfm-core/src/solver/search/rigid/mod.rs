@@ -123,30 +123,56 @@ impl<'a> RigidSearch<'a> {
     /// The best rigid consensus with pairs rigid at this noise (normalised units); `None` where no four tracks are
     /// rigid. Ends at the first that is never chance.
     pub fn run(&self, noise: f64) -> Option<Rigid> {
-        let graph = self.rigid_pairs(noise)?;
-        let mut best: Option<Rigid> = None;
+        let all: Vec<usize> = (0..self.block.tracks()).collect();
+        let graph = self.rigid_pairs(&all, noise)?;
+        let mut best = None;
         for (focal, edges) in graph.best_focals(OPTIONS.focals_grown) {
-            let mut covered = vec![false; self.block.tracks()];
+            let mut covered = vec![false; all.len()];
             for _ in 0..OPTIONS.cores_grown {
                 let core = edges.core(&covered);
                 if core.len() < LEAST_TRACKS {
                     break;
                 }
                 core.iter().for_each(|&track| covered[track] = true);
-                for factor in OPTIONS.grown_noise {
-                    let Some(grown) = self.grow(focal, core.clone(), factor * noise) else { continue };
-                    let settled = self.settle(grown);
-                    let certainty = settled.ln_false_alarms(self.spread);
-                    if best.as_ref().is_none_or(|best| certainty < best.ln_false_alarms(self.spread)) {
-                        best = Some(settled);
-                    }
-                    if certainty < OPTIONS.ln_never_chance {
-                        return best;
-                    }
+                if self.improve(&mut best, focal, &core, noise) {
+                    return best;
                 }
             }
         }
         best
+    }
+
+    /// The best rigid consensus that grows from tracks that others chose.
+    ///
+    /// * `noise`: normalised units
+    pub fn around(&self, chosen: &[usize], noise: f64) -> Option<Rigid> {
+        if chosen.len() < LEAST_TRACKS {
+            return None;
+        }
+        let mut best = None;
+        for (focal, _) in self.rigid_pairs(chosen, noise)?.best_focals(OPTIONS.focals_grown) {
+            if self.improve(&mut best, focal, chosen, noise) {
+                break;
+            }
+        }
+        best
+    }
+
+    /// Grows a consensus from a core and keeps it where it is less likely to be chance than the best one; true once
+    /// that is never chance.
+    fn improve(&self, best: &mut Option<Rigid>, focal: f64, core: &[usize], noise: f64) -> bool {
+        for factor in OPTIONS.grown_noise {
+            let Some(grown) = self.grow(focal, core.to_vec(), factor * noise) else { continue };
+            let settled = self.settle(grown);
+            let certainty = settled.ln_false_alarms(self.spread);
+            if best.as_ref().is_none_or(|best| certainty < best.ln_false_alarms(self.spread)) {
+                *best = Some(settled);
+            }
+            if certainty < OPTIONS.ln_never_chance {
+                return true;
+            }
+        }
+        false
     }
 
     /// The consensus refitted on this block, which may have more tracks and views than the one it was found on.
@@ -183,16 +209,16 @@ impl<'a> RigidSearch<'a> {
         self.depths[track * self.block.views() + view]
     }
 
-    /// Statistics of all pairs over the views, and how many are rigid at each focal length.
-    fn rigid_pairs(&self, noise: f64) -> Option<Graph> {
-        let (views, tracks) = (self.block.views(), self.block.tracks());
+    /// Statistics over the views of all pairs of some tracks, and how many are rigid at each focal length.
+    fn rigid_pairs(&self, of: &[usize], noise: f64) -> Option<Graph> {
+        let (views, tracks) = (self.block.views(), of.len());
         let tolerance = self.median_depth * (OPTIONS.pair_tolerance * noise + OPTIONS.grid_tolerance);
         let mut graph = Graph { tracks, tolerance, pairs: Vec::with_capacity(tracks * (tracks - 1) / 2) };
-        for a in 0..tracks {
+        for (k, &a) in of.iter().enumerate() {
             if self.stop.is_stopped() {
                 return None;
             }
-            for b in a + 1..tracks {
+            for &b in &of[k + 1..] {
                 let mut pair = Pair::default();
                 for view in 0..views {
                     let (first, second) = (self.block.point(view, a), self.block.point(view, b));
