@@ -132,19 +132,11 @@ impl Continuation {
         if iteration == self.rank_start() {
             self.consensus_alpha = self.alpha_of_consensus(balanced, weights)?;
         }
-        let gate = match self.start.has_depths {
-            true => {
-                let freedom = balanced.nrows().saturating_sub(RANK).max(1) as f64;
-                (chi_square_gate(freedom) / chi_square_median(freedom)).sqrt().max(self.options.least_gate)
-            }
-            false => self.options.gate_without_depths,
-        };
         if iteration == self.growth_start() {
-            let first = gate * self.options.first_gate_factor;
-            self.tolerance = self.tolerance_of_consensus(first, balanced, weights);
+            self.tolerance = self.tolerance_of_consensus(self.options.first_gate_factor, balanced, weights);
         }
         if iteration == self.second_growth_start() {
-            self.tolerance = self.tolerance_of_consensus(gate, balanced, weights);
+            self.tolerance = self.tolerance_of_consensus(1.0, balanced, weights);
         }
         Ok(())
     }
@@ -198,10 +190,24 @@ impl Continuation {
         Ok(alpha.clamp(self.start.least_alpha, self.options.most_alpha))
     }
 
+    /// Residuals, in units of the measured noise, at which a track leaves the consensus: wherever wrong tracks are, and
+    /// where they are far away.
+    fn gates(&self, rows: usize, kept: usize) -> (f64, f64) {
+        let ContinuationOptions { least_gate, gate_without_depths: gate, gate_growth, growth_from, .. } = self.options;
+        if self.start.has_depths {
+            let freedom = rows.saturating_sub(RANK).max(1) as f64;
+            let gate = (chi_square_gate(freedom) / chi_square_median(freedom)).sqrt().max(least_gate);
+            return (gate, gate);
+        }
+        (gate, gate + gate_growth * (kept as f64 / growth_from).log10().max(0.0))
+    }
+
     /// The residual at which growth ends: so many standard deviations of the consensus' own, its degrees of freedom
     /// counted, but no more than a share of what wrong tracks leave. Above that they are worth their cost, and all of
     /// them may join.
-    fn tolerance_of_consensus(&self, gate: f64, balanced: &DMatrix<f64>, weights: &[f64]) -> f64 {
+    ///
+    /// * `factor`: on the gate
+    fn tolerance_of_consensus(&self, factor: f64, balanced: &DMatrix<f64>, weights: &[f64]) -> f64 {
         let (least, most) = self.options.tolerance;
         let kept: Vec<usize> = (0..weights.len()).filter(|&j| weights[j] > THRESHOLD).collect();
         if kept.len() <= RANK {
@@ -211,8 +217,10 @@ impl Continuation {
         let Some(basis) = dominant_subspace(&consensus, RANK) else { return least };
         let mut squared: Vec<f64> = subspace_residuals(&consensus, &basis).iter().map(|r| r.powi(2)).collect();
         let freedom = (kept.len() - RANK) as f64 / kept.len() as f64;
-        let tolerance = gate * (midpoint_median(&mut squared) / freedom).sqrt();
+        let noise = factor * (midpoint_median(&mut squared) / freedom).sqrt();
         let of_wrong = wrong_residual(balanced, weights, &basis);
+        let (gate, grown) = self.gates(balanced.nrows(), kept.len());
+        let tolerance = (gate * noise).max((grown * noise).min(self.options.separation * of_wrong));
         tolerance.min(most).min(self.options.wrong_share * of_wrong).max(least)
     }
 }

@@ -1,5 +1,7 @@
 //! The constants of the choice among heads, with their reasons. Figures: those of
-//! [`crate::network::continuation::ContinuationOptions`]; of single ablations over seeds 0 to 9.
+//! [`ContinuationOptions`]; of single ablations over seeds 0 to 9.
+
+use crate::network::head::ContinuationOptions;
 
 /// How many heads are optimised, how they differ, and when one is accepted.
 #[derive(Debug, Clone, PartialEq)]
@@ -36,8 +38,7 @@ impl HeadOptions {
         accepted_by_rank: 8,
         // Four tracks determine the cameras that e is measured of; they end the heads, but are never verified.
         accepted_by_daq: 4,
-        // Wrong consensuses leave about as much as they were selected by; right ones, noise.
-        separation: 0.4,
+        separation: ContinuationOptions::DEFAULT.separation,
         // Right sets of eight and ten tracks leave .001 to .005, sets with one or two wrong ones in their place .5 and
         // more, of rank 4 or nearly so: without this F1 is .99 at 95 and 96 %.
         daq_acceptable: 0.2,
