@@ -9,7 +9,7 @@ use crate::formats::{Export, Format, result_files};
 
 /// Warnings that can be why a result is less than METRIC, the most probable cause first, each with what would help. A
 /// wrong size or a wrong model comes before what the views show under it.
-const REMEDIES: [(WarningCode, &str); 14] = [
+const REMEDIES: [(WarningCode, &str); 15] = [
     (WarningCode::PointsOutsideImage, "give the size of the images whose pixels these are (--width, --height)"),
     (
         WarningCode::ModelMismatch,
@@ -17,6 +17,7 @@ const REMEDIES: [(WarningCode, &str); 14] = [
          (--view-table); else check the tracks",
     ),
     (WarningCode::Cheirality, "check the order of the views and the size of the images"),
+    (WarningCode::LittleMotion, "add views that are taken from farther apart and turned against each other"),
     (WarningCode::PlanarOrRotation, "add views from other places, and objects off the plane"),
     (WarningCode::PureRotation, "add views that the camera has moved and turned for"),
     (

@@ -8,6 +8,9 @@ pub fn warning(code: WarningCode) -> &'static str {
         WarningCode::PlanarOrRotation => {
             "The points lie on one plane, or the camera only turned, or turned and zoomed: such views show little depth."
         }
+        WarningCode::LittleMotion => {
+            "The views hardly differ: the camera nearly stood still, and nothing tells a turn from a shift."
+        }
         WarningCode::PlanarScene => {
             "The points lie on one plane. Views that are tilted against each other tell a focal length all the same."
         }

@@ -53,6 +53,7 @@ const WARNINGS = {
   UNVERIFIED_RANKING: "Nothing was verified; weights are a network's ranking",
   DUPLICATE_TRACKS: "Tracks have the same observations",
   STATIC_TRACKS: "Tracks stay in place in the image",
+  LITTLE_MOTION: "The views hardly differ",
 };
 
 const JOB_NAME = /^tenants\/[a-z0-9-]{1,63}\/jobs\/[a-z0-9-]{1,63}$/;

@@ -87,7 +87,8 @@ twins! {
         CameraGroupsMerged,
         UnverifiedRanking,
         DuplicateTracks,
-        StaticTracks;
+        StaticTracks,
+        LittleMotion;
         Unknown
     }
 }
@@ -118,6 +119,7 @@ mod tests {
     #[test]
     fn names_on_the_wire_are_the_domains_with_the_enums_prefix() {
         for code in [
+            WarningCode::LittleMotion,
             WarningCode::PlanarOrRotation,
             WarningCode::PlanarScene,
             WarningCode::PureRotation,

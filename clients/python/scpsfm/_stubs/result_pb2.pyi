@@ -61,6 +61,7 @@ class WarningCode(int, metaclass=_enum_type_wrapper.EnumTypeWrapper):
     WARNING_CODE_UNVERIFIED_RANKING: _ClassVar[WarningCode]
     WARNING_CODE_DUPLICATE_TRACKS: _ClassVar[WarningCode]
     WARNING_CODE_STATIC_TRACKS: _ClassVar[WarningCode]
+    WARNING_CODE_LITTLE_MOTION: _ClassVar[WarningCode]
 
 class LeftOutReason(int, metaclass=_enum_type_wrapper.EnumTypeWrapper):
     __slots__ = ()
@@ -105,6 +106,7 @@ WARNING_CODE_POINTS_OUTSIDE_IMAGE: WarningCode
 WARNING_CODE_UNVERIFIED_RANKING: WarningCode
 WARNING_CODE_DUPLICATE_TRACKS: WarningCode
 WARNING_CODE_STATIC_TRACKS: WarningCode
+WARNING_CODE_LITTLE_MOTION: WarningCode
 LEFT_OUT_REASON_UNSPECIFIED: LeftOutReason
 LEFT_OUT_REASON_NO_OBSERVATIONS: LeftOutReason
 LEFT_OUT_REASON_OUTSIDE_BLOCK: LeftOutReason

@@ -8,6 +8,8 @@ use serde::{Deserialize, Serialize};
 pub enum WarningCode {
     /// Homographies explain the views, and the data do not tell a planar scene from a camera that only turned.
     PlanarOrRotation,
+    /// The views hardly differ but for noise: a turn explains them as well as a shift.
+    LittleMotion,
     /// The points of the consensus lie on a plane.
     PlanarScene,
     /// The camera turned about its centre without moving: in a metric result tracks have no points.
@@ -56,7 +58,8 @@ impl WarningCode {
     /// Whether it can be why there is no focal length; the others tell of what was assumed or left out.
     pub fn refuses(self) -> bool {
         match self {
-            WarningCode::PureTranslation
+            WarningCode::LittleMotion
+            | WarningCode::PureTranslation
             | WarningCode::UnobservableFocal
             | WarningCode::SecondMinimum
             | WarningCode::ModelMismatch
@@ -83,6 +86,7 @@ impl WarningCode {
     pub fn name(self) -> &'static str {
         match self {
             WarningCode::PlanarOrRotation => "PLANAR_OR_ROTATION",
+            WarningCode::LittleMotion => "LITTLE_MOTION",
             WarningCode::PlanarScene => "PLANAR_SCENE",
             WarningCode::PureRotation => "PURE_ROTATION",
             WarningCode::PureTranslation => "PURE_TRANSLATION",

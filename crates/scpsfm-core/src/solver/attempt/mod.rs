@@ -25,8 +25,13 @@ use crate::geometry::statistics::median;
 const OPTIONS: AttemptOptions = AttemptOptions::DEFAULT;
 
 /// What describes motions and scenes that are special cases.
-const CRITICAL: [WarningCode; 4] =
-    [WarningCode::PureTranslation, WarningCode::PureRotation, WarningCode::PlanarScene, WarningCode::PlanarOrRotation];
+const CRITICAL: [WarningCode; 5] = [
+    WarningCode::LittleMotion,
+    WarningCode::PureTranslation,
+    WarningCode::PureRotation,
+    WarningCode::PlanarScene,
+    WarningCode::PlanarOrRotation,
+];
 
 /// Merit of a WEAK attempt, see [`Attempt::merit`].
 pub const WEAK_MERIT: u8 = 3;

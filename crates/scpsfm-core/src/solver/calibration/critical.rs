@@ -144,7 +144,7 @@ fn without_parallax(
     let worse = format!("a camera that only turns fits worse than {reference} by {deviations:.1} standard deviations");
     let (code, because) = match (turns, translates) {
         (true, true) => (
-            WarningCode::PlanarOrRotation,
+            WarningCode::LittleMotion,
             "the camera hardly moved, and a turn explains the views as well as a shift".to_owned(),
         ),
         (true, false) => {

@@ -43,7 +43,7 @@ fn its_own_weights_decide_and_the_rest_is_calibrated() {
     assert_eq!(heads.weights.len(), 200);
 }
 
-/// Perspective is no noise: some right tracks are five times as far from rank 4 as the median one.
+/// Perspective is no noise: one right track in twenty is three times as far from rank 4 as the median one.
 #[test]
 fn without_depths_next_to_no_right_track_is_lost() {
     let mut recall = 0.0;

@@ -71,6 +71,31 @@ fn a_camera_that_only_turns_is_calibrated_by_its_directions() {
     }
 }
 
+#[test]
+fn a_camera_that_nearly_stands_still_has_no_focal_length() {
+    for seed in 0..3 {
+        let (_, scene) = scene(SceneOptions { noise: 0.001, outliers: 0.3, seed, ..default() });
+        let mut raw = scene.input.clone();
+        let mut rng = ChaCha8Rng::seed_from_u64(seed);
+        let mut noise = || (0..12).map(|_| rng.random::<f64>() - 0.5).sum::<f64>();
+        let mut first = vec![None; raw.track_count];
+        for k in 0..raw.view.len() {
+            let track = raw.track[k] as usize;
+            let (x, y) = *first[track].get_or_insert((raw.x[k], raw.y[k]));
+            if scene.truth.inlier[track] {
+                (raw.x[k], raw.y[k]) = (x + noise(), y + noise());
+            }
+        }
+        let input = Input::new(raw, &Limits::default(), "still").expect("valid input");
+        let solution = solved(&input, &SolveSettings::default());
+        assert_eq!(solution.grade, Some(Grade::ProjectiveOnly), "seed {seed}: {:?}", solution.warnings);
+        assert!(solution.calibrations.is_empty(), "seed {seed}");
+        assert!(warns(&solution, WarningCode::LittleMotion), "seed {seed}: {:?}", solution.warnings);
+        let f1 = agreement(&solution.tracks.inlier, &scene.truth.inlier).f1;
+        assert!(f1 > 0.98, "seed {seed}: F1 {f1}");
+    }
+}
+
 /// All around, most views share nothing: each joins by the directions that its neighbours know.
 #[test]
 fn a_full_turn_registers_every_view() {
