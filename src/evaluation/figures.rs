@@ -22,15 +22,26 @@ const MOST_DECADES: f64 = 4.0;
 struct Measure {
     label: &'static str,
     of: fn(&Cell) -> Option<f64>,
+    interval: fn(&Cell) -> Option<[f64; 2]>,
     /// Fixed bounds of a linear axis; `None`: logarithmic, by the values.
     bounds: Option<(f64, f64)>,
 }
 
 const MEASURES: [Measure; 4] = [
-    Measure { label: "F1", of: |cell| Some(cell.mean_f1), bounds: Some((0.0, 1.0)) },
-    Measure { label: "2D error (px)", of: |cell| cell.error_2d_px, bounds: None },
-    Measure { label: "3D error", of: |cell| cell.error_3d, bounds: None },
-    Measure { label: "focal error", of: |cell| cell.focal_error, bounds: None },
+    Measure { label: "F1", of: |cell| Some(cell.mean_f1), interval: |cell| cell.f1_interval, bounds: Some((0.0, 1.0)) },
+    Measure {
+        label: "2D error (px)",
+        of: |cell| cell.error_2d_px,
+        interval: |cell| cell.error_2d_px_interval,
+        bounds: None,
+    },
+    Measure { label: "3D error", of: |cell| cell.error_3d, interval: |cell| cell.error_3d_interval, bounds: None },
+    Measure {
+        label: "focal error",
+        of: |cell| cell.focal_error,
+        interval: |cell| cell.focal_error_interval,
+        bounds: None,
+    },
 ];
 
 /// Colours that differ in lightness too (Okabe & Ito 2008), and dashes for whoever sees none.
@@ -107,11 +118,14 @@ fn legend(out: &mut String, plan: &Plan, depths: Depths) {
         text(out, (left + 29.0, 19.5), "start", "#000", contestant.name());
         left += 44.0 + 6.2 * contestant.name().len() as f64;
     }
+    text(out, (left, 19.5), "start", "#555", "bars: 95 % intervals over the seeds");
 }
 
 fn panel(out: &mut String, x: &Axis, top: f64, measure: &Measure, cells: &[&Cell]) {
-    let values = || cells.iter().filter_map(|cell| (measure.of)(cell)).filter(|value| value.is_finite());
-    let Some(y) = Axis::vertical(values(), top, measure.bounds) else {
+    let interval = |cell: &Cell| (measure.interval)(cell).filter(|ends| ends.iter().all(|end| end.is_finite()));
+    let values = cells.iter().filter_map(|cell| (measure.of)(cell)).filter(|value| value.is_finite());
+    let ends = cells.iter().filter_map(|cell| interval(cell)).flatten();
+    let Some(y) = Axis::vertical(values.chain(ends), top, measure.bounds) else {
         text(out, ((x.from + x.to) / 2.0, top + PANEL.1 / 2.0), "middle", "#888", "nothing reconstructed");
         frame(out, x, top);
         return;
@@ -140,12 +154,14 @@ fn panel(out: &mut String, x: &Axis, top: f64, measure: &Measure, cells: &[&Cell
     contestants.sort_unstable();
     contestants.dedup();
     for contestant in contestants {
-        let points: Vec<(f64, f64)> = cells
-            .iter()
-            .filter(|cell| cell.contestant == contestant)
+        let own = || cells.iter().filter(|cell| cell.contestant == contestant);
+        let points: Vec<(f64, f64)> = own()
             .filter_map(|cell| Some((x.place(cell.x), y.place((measure.of)(cell).filter(|value| value.is_finite())?))))
             .collect();
         line(out, contestant, &points);
+        for (cell, ends) in own().filter_map(|cell| Some((cell, interval(cell)?))) {
+            bar(out, contestant, x.place(cell.x), ends.map(|end| y.place(end)));
+        }
     }
 }
 
@@ -170,6 +186,11 @@ fn line(out: &mut String, contestant: Contestant, points: &[(f64, f64)]) {
     for (x, y) in points {
         let _ = write!(out, "<circle cx=\"{x:.1}\" cy=\"{y:.1}\" r=\"2.2\" fill=\"{colour}\"/>");
     }
+}
+
+fn bar(out: &mut String, contestant: Contestant, x: f64, [from, to]: [f64; 2]) {
+    let (colour, _) = stroke(contestant);
+    let _ = write!(out, "<path d=\"M{x:.1} {from:.1}V{to:.1}\" stroke=\"{colour}\"/>");
 }
 
 fn text(out: &mut String, (x, y): (f64, f64), anchor: &str, colour: &str, content: &str) {
@@ -283,6 +304,10 @@ mod tests {
             error_2d_px: error,
             error_3d: error,
             focal_error: error,
+            f1_interval: Some([0.9 * x, x]),
+            error_2d_px_interval: None,
+            error_3d_interval: None,
+            focal_error_interval: None,
             focal_ratio: None,
             focal_ratio_interval: None,
             metric: 1.0,
@@ -310,6 +335,7 @@ mod tests {
         let svg = svg(&plan, &cells, Depths::None);
         // Four F1 values; two finite errors on each of the three other rows.
         assert_eq!(svg.matches("<circle").count(), 4 + 3 * 2);
+        assert_eq!(svg.matches("<path").count(), 4, "F1 alone has intervals");
         assert!(!svg.contains("NaN") && !svg.contains("inf"), "{svg}");
         assert!(svg.contains("nothing reconstructed"), "the other sweeps have no cells");
         // Another way of giving depths has no cells at all.

@@ -45,6 +45,11 @@ pub struct Cell {
     pub error_2d_px: Option<f64>,
     pub error_3d: Option<f64>,
     pub focal_error: Option<f64>,
+    /// Bootstrap intervals (95 %, seeds resampled) of the mean F1 and of these medians.
+    pub f1_interval: Option<[f64; 2]>,
+    pub error_2d_px_interval: Option<[f64; 2]>,
+    pub error_3d_interval: Option<[f64; 2]>,
+    pub focal_error_interval: Option<[f64; 2]>,
     /// Median focal error over the oracle's, on the seeds where this contestant gives one, with its bootstrap interval
     /// (95 %, seeds resampled in pairs).
     pub focal_ratio: Option<f64>,
@@ -98,6 +103,11 @@ fn cell(
         })
         .collect();
     let with_oracle = contestant != Contestant::Oracle && !focal_errors.is_empty();
+    let f1: Vec<f64> = own().map(|measures| measures.f1).collect();
+    let error_2d_px: Vec<f64> = own().filter_map(|measures| measures.error_2d_px).collect();
+    let error_3d: Vec<f64> = own().filter_map(|measures| measures.error_3d).collect();
+    let focal_error: Vec<f64> = own().filter_map(|measures| measures.log_focal_error.map(f64::abs)).collect();
+    let of_median = |values: &[f64]| bootstrap(values, |resampled| median(resampled.to_vec()));
     Cell {
         sweep,
         x,
@@ -105,7 +115,7 @@ fn cell(
         depths,
         contestant,
         seeds: pairs.len(),
-        mean_f1: own().map(|measures| measures.f1).sum::<f64>() / count,
+        mean_f1: f1.iter().sum::<f64>() / count,
         least_f1: own().map(|measures| measures.f1).fold(1.0, f64::min),
         observation_f1: mean(
             own().filter_map(|measures| measures.observations).map(|observations| observations.f1).collect(),
@@ -115,11 +125,15 @@ fn cell(
             own().filter(|measures| measures.f1 >= REACHED_F1).map(|measures| measures.seconds).collect(),
         ),
         solved: own().filter(|measures| measures.solved).count() as f64 / count,
-        error_2d_px: median(own().filter_map(|measures| measures.error_2d_px).collect()),
-        error_3d: median(own().filter_map(|measures| measures.error_3d).collect()),
-        focal_error: median(own().filter_map(|measures| measures.log_focal_error.map(f64::abs)).collect()),
+        f1_interval: bootstrap(&f1, |resampled| mean(resampled.to_vec())),
+        error_2d_px_interval: of_median(&error_2d_px),
+        error_3d_interval: of_median(&error_3d),
+        focal_error_interval: of_median(&focal_error),
+        error_2d_px: median(error_2d_px),
+        error_3d: median(error_3d),
+        focal_error: median(focal_error),
         focal_ratio: if with_oracle { ratio_of_medians(&focal_errors) } else { None },
-        focal_ratio_interval: if with_oracle { bootstrap(&focal_errors) } else { None },
+        focal_ratio_interval: if with_oracle { bootstrap(&focal_errors, ratio_of_medians) } else { None },
         metric: share(Grade::Metric),
         weak: share(Grade::Weak),
         projective_only: share(Grade::ProjectiveOnly),
@@ -143,18 +157,18 @@ fn ratio_of_medians(pairs: &[(f64, f64)]) -> Option<f64> {
     (oracle > 0.0).then_some(own / oracle)
 }
 
-fn bootstrap(pairs: &[(f64, f64)]) -> Option<[f64; 2]> {
+/// Interval of a statistic over resampled values; `None` where it has no value.
+fn bootstrap<T: Copy>(values: &[T], statistic: impl Fn(&[T]) -> Option<f64>) -> Option<[f64; 2]> {
     let mut rng = ChaCha8Rng::seed_from_u64(BOOTSTRAP_SEED);
-    let mut ratios: Vec<f64> = (0..RESAMPLES)
+    let mut found: Vec<f64> = (0..RESAMPLES)
         .filter_map(|_| {
-            let resampled: Vec<(f64, f64)> =
-                (0..pairs.len()).map(|_| pairs[rng.random_range(0..pairs.len())]).collect();
-            ratio_of_medians(&resampled)
+            let resampled: Vec<T> = (0..values.len()).map(|_| values[rng.random_range(0..values.len())]).collect();
+            statistic(&resampled)
         })
         .collect();
-    ratios.sort_by(f64::total_cmp);
-    let last = ratios.len().checked_sub(1)? as f64;
-    let at = |share: f64| ratios[(share * last).round() as usize];
+    found.sort_by(f64::total_cmp);
+    let last = found.len().checked_sub(1)? as f64;
+    let at = |share: f64| found[(share * last).round() as usize];
     Some([at(TAIL), at(1.0 - TAIL)])
 }
 
@@ -281,12 +295,12 @@ mod tests {
         };
         let (few, many) = (pairs(20), pairs(2000));
         let width = |pairs: &[(f64, f64)]| {
-            let [low, high] = bootstrap(pairs).expect("values");
+            let [low, high] = bootstrap(pairs, ratio_of_medians).expect("values");
             let ratio = ratio_of_medians(pairs).expect("values");
             assert!(low <= ratio && ratio <= high, "{low} {ratio} {high}");
             high - low
         };
         assert!(width(&many) < 0.3 * width(&few));
-        assert_eq!(bootstrap(&[]), None);
+        assert_eq!(bootstrap(&[], ratio_of_medians), None);
     }
 }
