@@ -198,6 +198,7 @@ mod tests {
     #[test]
     fn every_warning_that_refuses_a_focal_length_is_a_cause() {
         let codes = [
+            WarningCode::LittleMotion,
             WarningCode::PureTranslation,
             WarningCode::UnobservableFocal,
             WarningCode::SecondMinimum,

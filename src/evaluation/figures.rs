@@ -11,6 +11,8 @@ use crate::synthetic::SceneOptions;
 const PANEL: (f64, f64) = (210.0, 120.0);
 const GAP: (f64, f64) = (62.0, 46.0);
 const MARGIN: (f64, f64) = (66.0, 58.0);
+/// Between the bars of two contestants on the same cell.
+const BAR_DISTANCE: f64 = 1.2;
 /// Columns that there is always room for, so that the legend fits.
 const LEAST_COLUMNS: usize = 3;
 /// Ratio of the largest to the smallest value on the horizontal axis from which it is logarithmic.
@@ -22,6 +24,7 @@ const MOST_DECADES: f64 = 4.0;
 struct Measure {
     label: &'static str,
     of: fn(&Cell) -> Option<f64>,
+    /// Where it lies with a probability of 95 %.
     interval: fn(&Cell) -> Option<[f64; 2]>,
     /// Fixed bounds of a linear axis; `None`: logarithmic, by the values.
     bounds: Option<(f64, f64)>,
@@ -118,7 +121,9 @@ fn legend(out: &mut String, plan: &Plan, depths: Depths) {
         text(out, (left + 29.0, 19.5), "start", "#000", contestant.name());
         left += 44.0 + 6.2 * contestant.name().len() as f64;
     }
-    text(out, (left, 19.5), "start", "#555", "bars: 95 % intervals over the seeds");
+    if plan.seeds > 1 {
+        text(out, (MARGIN.0, 35.0), "start", "#555", "Bars: 95 % bootstrap intervals over the scenes of a cell");
+    }
 }
 
 fn panel(out: &mut String, x: &Axis, top: f64, measure: &Measure, cells: &[&Cell]) {
@@ -153,14 +158,17 @@ fn panel(out: &mut String, x: &Axis, top: f64, measure: &Measure, cells: &[&Cell
     let mut contestants: Vec<Contestant> = cells.iter().map(|cell| cell.contestant).collect();
     contestants.sort_unstable();
     contestants.dedup();
-    for contestant in contestants {
+    let middle = (contestants.len().max(1) - 1) as f64 / 2.0;
+    for (place, contestant) in contestants.into_iter().enumerate() {
         let own = || cells.iter().filter(|cell| cell.contestant == contestant);
         let points: Vec<(f64, f64)> = own()
             .filter_map(|cell| Some((x.place(cell.x), y.place((measure.of)(cell).filter(|value| value.is_finite())?))))
             .collect();
         line(out, contestant, &points);
         for (cell, ends) in own().filter_map(|cell| Some((cell, interval(cell)?))) {
-            bar(out, contestant, x.place(cell.x), ends.map(|end| y.place(end)));
+            // Side by side: many lie at the same place.
+            let beside = (place as f64 - middle) * BAR_DISTANCE;
+            bar(out, contestant, x.place(cell.x) + beside, ends.map(|end| y.place(end)));
         }
     }
 }
@@ -188,6 +196,7 @@ fn line(out: &mut String, contestant: Contestant, points: &[(f64, f64)]) {
     }
 }
 
+/// The ends of an interval, joined.
 fn bar(out: &mut String, contestant: Contestant, x: f64, [from, to]: [f64; 2]) {
     let (colour, _) = stroke(contestant);
     let _ = write!(out, "<path d=\"M{x:.1} {from:.1}V{to:.1}\" stroke=\"{colour}\"/>");

@@ -115,7 +115,7 @@ fn cell(
         depths,
         contestant,
         seeds: pairs.len(),
-        mean_f1: f1.iter().sum::<f64>() / count,
+        mean_f1: mean(f1.clone()).unwrap_or(0.0),
         least_f1: own().map(|measures| measures.f1).fold(1.0, f64::min),
         observation_f1: mean(
             own().filter_map(|measures| measures.observations).map(|observations| observations.f1).collect(),
@@ -238,11 +238,15 @@ pub fn coverage(plan: &Plan, records: &Records, contestant: Contestant) -> Optio
 pub fn csv(cells: &[Cell]) -> String {
     let mut text = String::from(
         "sweep,x,place,depths,contestant,seeds,mean_f1,least_f1,observation_f1,reached,seconds_to_reach,solved,error_2d_px,error_3d,focal_error,focal_ratio,\
-         focal_ratio_low,focal_ratio_high,metric,weak,projective_only,median_seconds\n",
+         focal_ratio_low,focal_ratio_high,metric,weak,projective_only,median_seconds,f1_low,f1_high,error_2d_px_low,\
+         error_2d_px_high,error_3d_low,error_3d_high,focal_error_low,focal_error_high\n",
     );
     let shown = |value: Option<f64>| value.map_or_else(String::new, |value| format!("{value:.6}"));
     for cell in cells {
-        let [low, high] = cell.focal_ratio_interval.map_or([None; 2], |interval| interval.map(Some));
+        let ends = |interval: Option<[f64; 2]>| interval.map_or([None; 2], |interval| interval.map(Some));
+        let [low, high] = ends(cell.focal_ratio_interval);
+        let intervals =
+            [cell.f1_interval, cell.error_2d_px_interval, cell.error_3d_interval, cell.focal_error_interval];
         let values = [
             Some(cell.mean_f1),
             Some(cell.least_f1),
@@ -261,7 +265,7 @@ pub fn csv(cells: &[Cell]) -> String {
             Some(cell.projective_only),
             Some(cell.median_seconds),
         ];
-        let values: Vec<String> = values.into_iter().map(shown).collect();
+        let values: Vec<String> = values.into_iter().chain(intervals.into_iter().flat_map(ends)).map(shown).collect();
         text.push_str(&format!(
             "{},{},{},{},{},{},{}\n",
             cell.sweep,

@@ -35,7 +35,8 @@ options! {
         strayed_sigmas: f64 = 4.0,
         /// Noise from which depths judge what image points have verified, normalised units. Below, image points alone
         /// lose next to no track (mean F1 1.000 at 1 %, .997 at 2 %: `scpsfm evaluate --sweeps noise --depths none`),
-        /// and the time is saved.
+        /// and the time is saved. From it on, what depths verify is not replaced by image points alone: with 8 right
+        /// tracks of 200, F1 rises from .85 to .99 at 3 % and from .84 to .97 at 5 % (20 scenes each).
         strong_noise: f64 = 0.015,
         /// Share of the consensus's inliers that must be rigid for depths to judge. Of depths that are not true to one
         /// scale next to none are.
@@ -158,14 +159,14 @@ pub fn weights(
     problem: &Problem,
     searched: &Block,
     consensus: &Consensus,
-    found: &Option<Rigid>,
+    found: Option<&Rigid>,
 ) -> Option<TrackWeights> {
     let all = problem.block(&searched.views).sample_with(OPTIONS.most_weighed, problem.settings.seed, &searched.tracks);
     let block = &all.complete;
     let search = RigidSearch::new(block, portfolio::spread(block), problem.stop)?;
     let place = |track: usize| all.tracks.binary_search(&searched.tracks[track]).ok();
     let inliers: Vec<usize> = consensus.inliers().into_iter().filter_map(place).collect();
-    let rigid = search.refit(found.as_ref()?, &inliers)?;
+    let rigid = search.refit(found?, &inliers)?;
     let shared = inliers.iter().filter(|&&track| rigid.inlier[track]).count();
     if (shared as f64) < OPTIONS.rigid_share * inliers.len() as f64 {
         return None;

@@ -190,23 +190,29 @@ impl Continuation {
         Ok(alpha.clamp(self.start.least_alpha, self.options.most_alpha))
     }
 
-    /// Residuals, in units of the measured noise, at which a track leaves the consensus: wherever wrong tracks are, and
-    /// where they are far away.
+    /// Residuals, in units of the measured noise, at which a track leaves the consensus: in any case, and as far as the
+    /// consensus stands apart from wrong tracks.
+    ///
+    /// * `rows`: of the matrix
+    /// * `kept`: tracks of the consensus
     fn gates(&self, rows: usize, kept: usize) -> (f64, f64) {
-        let ContinuationOptions { least_gate, gate_without_depths: gate, gate_growth, growth_from, .. } = self.options;
+        let options = &self.options;
         if self.start.has_depths {
             let freedom = rows.saturating_sub(RANK).max(1) as f64;
-            let gate = (chi_square_gate(freedom) / chi_square_median(freedom)).sqrt().max(least_gate);
+            let gate = (chi_square_gate(freedom) / chi_square_median(freedom)).sqrt().max(options.least_gate);
             return (gate, gate);
         }
-        (gate, gate + gate_growth * (kept as f64 / growth_from).log10().max(0.0))
+        let gate = options.gate_without_depths;
+        (gate, gate + options.gate_per_decade * (kept as f64 / options.gate_tracks).log10().max(0.0))
     }
 
     /// The residual at which growth ends: so many standard deviations of the consensus' own, its degrees of freedom
-    /// counted, but no more than a share of what wrong tracks leave. Above that they are worth their cost, and all of
-    /// them may join.
+    /// counted, and more where it stands apart from wrong tracks all the same, but no more than a share of what these
+    /// leave. Above that they are worth their cost, and all of them may join.
     ///
-    /// * `factor`: on the gate
+    /// * `factor`: multiplies the gates
+    /// * `balanced`: 3n x m
+    /// * `weights`: one a column
     fn tolerance_of_consensus(&self, factor: f64, balanced: &DMatrix<f64>, weights: &[f64]) -> f64 {
         let (least, most) = self.options.tolerance;
         let kept: Vec<usize> = (0..weights.len()).filter(|&j| weights[j] > THRESHOLD).collect();
@@ -217,10 +223,10 @@ impl Continuation {
         let Some(basis) = dominant_subspace(&consensus, RANK) else { return least };
         let mut squared: Vec<f64> = subspace_residuals(&consensus, &basis).iter().map(|r| r.powi(2)).collect();
         let freedom = (kept.len() - RANK) as f64 / kept.len() as f64;
-        let noise = factor * (midpoint_median(&mut squared) / freedom).sqrt();
+        let noise = (midpoint_median(&mut squared) / freedom).sqrt();
         let of_wrong = wrong_residual(balanced, weights, &basis);
-        let (gate, grown) = self.gates(balanced.nrows(), kept.len());
-        let tolerance = (gate * noise).max((grown * noise).min(self.options.separation * of_wrong));
+        let (gate, apart) = self.gates(balanced.nrows(), kept.len());
+        let tolerance = (factor * gate * noise).max((factor * apart * noise).min(self.options.separation * of_wrong));
         tolerance.min(most).min(self.options.wrong_share * of_wrong).max(least)
     }
 }

@@ -139,7 +139,7 @@ fn a_right_consensus_is_separate_in_the_order_of_the_image_too() {
     let basis = dominant_subspace(&sorted, RANK).expect("finite");
     let own = midpoint_median(&mut subspace_residuals(&sorted, &basis));
     let of_wrong = wrong_residual(&sorted, &[1.0; 100], &basis);
-    assert!(own < 0.4 * of_wrong, "{own} {of_wrong}");
+    assert!(own < ContinuationOptions::DEFAULT.separation * of_wrong, "{own} {of_wrong}");
 }
 
 /// Beside the span of right tracks mismatched ones leave much more than these, beside that of wrong ones about as much.
@@ -150,6 +150,6 @@ fn mismatched_tracks_tell_a_right_consensus_from_a_wrong_one() {
         let basis = dominant_subspace(&matrix, RANK).expect("finite");
         let own = midpoint_median(&mut subspace_residuals(&matrix, &basis));
         let of_wrong = wrong_residual(&matrix, &[1.0; 100], &basis);
-        assert_eq!(own < 0.4 * of_wrong, is_right, "{own} {of_wrong}");
+        assert_eq!(own < ContinuationOptions::DEFAULT.separation * of_wrong, is_right, "{own} {of_wrong}");
     }
 }

@@ -16,9 +16,10 @@ use super::learned::TrackScores;
 use super::portfolio::{self, Found, Portfolio, VerifiedBy};
 use super::problem::Problem;
 use super::recorder::Recorder;
+use super::search::rigid::Rigid;
 use super::sequence::ProjectiveReconstruction;
 use super::{Error, all_tracks, near_duplicates, scpsfm, static_tracks, track_sampling};
-use crate::domain::{FocalPrior, Grade, Method, Proposal, Stage, WarningCode};
+use crate::domain::{FocalPrior, Grade, Method, Stage, WarningCode};
 use crate::geometry::bundle::metric::{Intrinsics, MetricReconstruction};
 use crate::geometry::statistics::median;
 
@@ -106,19 +107,26 @@ impl Attempt {
         matches!(self.found.verified_by, VerifiedBy::Depths { .. })
     }
 
-    /// Whether depths verify it, so that what image points alone say at a noise this strong (normalised units) is worth
-    /// less: hundreds of tracks fit some plane then.
-    pub fn outweighs_image_points_at(&self, noise: f64) -> bool {
-        self.is_by_depths() && noise > DepthOptions::DEFAULT.strong_noise
+    /// The rigid consensus behind it or beside it.
+    fn rigid(&self) -> Option<&Rigid> {
+        self.found.rigid.as_ref().map(|(_, rigid)| rigid)
+    }
+
+    /// Whether depths verify it, and it is worth more than what image points alone say of these views at this noise
+    /// (normalised units): in noise so strong dozens of wrong tracks fit some plane. Not than what has further views,
+    /// nor at less noise, where its own few tracks may hold wrong observations.
+    pub fn outweighs(&self, views: &[usize], noise: f64) -> bool {
+        let has = |view: &usize| self.views().binary_search(view).is_ok();
+        self.is_by_depths() && noise > DepthOptions::DEFAULT.strong_noise && views.iter().all(has)
     }
 
     /// Whether depths verify it, in noise so strong that image points verify nothing beside them. False for fewer than
     /// [`LEAST_INLIERS`] tracks, whose residuals do not tell noise from wrong observations, and for mixed residuals.
     pub fn is_beyond_image_points(&self) -> bool {
         let is_noisy = |found: &ProjectiveReconstruction| {
-            self.outweighs_image_points_at(found.noise) && found.tracks.len() >= LEAST_INLIERS
+            found.noise > DepthOptions::DEFAULT.strong_noise && found.tracks.len() >= LEAST_INLIERS
         };
-        self.projective.as_ref().is_some_and(is_noisy) && !self.has_mixed_residuals()
+        self.is_by_depths() && self.projective.as_ref().is_some_and(is_noisy) && !self.has_mixed_residuals()
     }
 
     /// Whether the residuals are of several kinds, most small and some large: tracks that hold wrong observations were
@@ -351,7 +359,7 @@ fn search(
     }
     problem.stopped()?;
     if refined.noise > DepthOptions::DEFAULT.strong_noise {
-        attempt.weights_by_depths = depths::weights(problem, &attempt.block, &refined, &attempt.found.rigid);
+        attempt.weights_by_depths = depths::weights(problem, &attempt.block, &refined, attempt.rigid());
     }
     attempt.found.consensus = Some(refined);
     Ok(attempt)
@@ -359,16 +367,16 @@ fn search(
 
 /// The rigid consensus of an attempt whose image points verify nothing; the attempt as it is where there is none.
 fn by_depths(problem: &Problem, mut attempt: Attempt) -> Attempt {
-    let Some(rigid) = &attempt.found.rigid else { return attempt };
+    let Some((proposal, rigid)) = &attempt.found.rigid else { return attempt };
     let consensus = depths::consensus(&attempt.block.complete, rigid, problem.initial_noise);
     attempt.found.verified_by = VerifiedBy::Depths { focal: rigid.focal };
-    attempt.found.winning_proposal = Some(Proposal::Rigidity);
+    attempt.found.winning_proposal = Some(*proposal);
     attempt.found.rejected_by_network = None;
     verified_by_depths(problem, attempt, consensus)
 }
 
 fn verified_by_depths(problem: &Problem, mut attempt: Attempt, consensus: Consensus) -> Attempt {
-    attempt.weights_by_depths = depths::weights(problem, &attempt.block, &consensus, &attempt.found.rigid);
+    attempt.weights_by_depths = depths::weights(problem, &attempt.block, &consensus, attempt.rigid());
     attempt.found.consensus = Some(consensus);
     attempt
 }

@@ -163,7 +163,12 @@ fn without_parallax(
         (true, false) => Upgrade::Rotation { metric: rotation.model, free },
         (false, false) if has_depth => Upgrade::Quadric(Some(plane.model)),
         (false, false) => Upgrade::Plane(plane.model),
-        (_, true) => {
+        (true, true) => {
+            let detail = "views that hardly differ leave the focal length free";
+            warnings.push(Warning::new(WarningCode::UnobservableFocal, detail));
+            Upgrade::None
+        }
+        (false, true) => {
             warnings.push(not_turning());
             Upgrade::None
         }

@@ -57,7 +57,9 @@ impl Best {
     }
 
     /// Whether it displaces another: clearly less likely to be chance, the proposal that came first wins. Of different
-    /// evidence, what image points alone verify is better: it holds whatever the depths are worth.
+    /// evidence, what image points alone verify beyond doubt is better: it holds whatever the depths are worth. An
+    /// extension, which is not tested against chance, is not, see
+    /// [`Attempt::outweighs`](crate::solver::attempt::Attempt::outweighs).
     ///
     /// Costs would not do to compare by: they depend on the noise that each was grown at.
     pub fn displaces(&self, other: &Self) -> bool {

@@ -3,7 +3,7 @@
 //! What is cheap goes first: rigid distances where depths are given, the scores of the network that was trained
 //! beforehand, reweighting, consistency, and uniform sampling, which needs no ranking to be right. Where they decide
 //! nothing, heads of the paper's network are optimised ([`super::scpsfm`]), and what each keeps is verified by
-//! geometry. A decisive consensus ends the search: a head takes longer than everything else. Each proposal's own time
+//! geometry, by rigid distances, too. A decisive consensus ends the search: a head takes longer than everything else. Each proposal's own time
 //! is kept.
 
 mod best;
@@ -41,8 +41,8 @@ pub struct Found {
     pub consensus: Option<Consensus>,
     /// What the consensus was verified by.
     pub verified_by: VerifiedBy,
-    /// The rigid consensus behind it or beside it, where depths were given and one is not chance.
-    pub rigid: Option<Rigid>,
+    /// The rigid consensus behind it or beside it, where depths were given and one is not chance, and what proposed it.
+    pub rigid: Option<(Proposal, Rigid)>,
     pub winning_proposal: Option<Proposal>,
     /// Inliers of a consensus that the trained network keeps from being accepted, and how many of them count.
     pub rejected_by_network: Option<(usize, usize)>,
@@ -78,7 +78,7 @@ pub struct Portfolio<'a> {
     near_duplicates: Option<(usize, usize)>,
     /// Consensuses of near-duplicates.
     near_duplicate_count: usize,
-    rigid: Option<Rigid>,
+    rigid: Option<(Proposal, Rigid)>,
     track_scores: Option<TrackScores>,
     /// The scene's own statistics go first, whatever the trained network says.
     geometry_first: bool,
@@ -143,6 +143,7 @@ impl<'a> Portfolio<'a> {
     ) -> Result<Found, crate::network::Error> {
         let rounds = if self.is_quick { OPTIONS.quick_rounds } else { OPTIONS.rounds };
         let mut heads = None;
+        let mut head_round = 0;
         self.ask(recorder, spread_weights);
         for round in 0..rounds {
             self.set_noise(round);
@@ -154,9 +155,11 @@ impl<'a> Portfolio<'a> {
                 let heads = heads.get_or_insert_with(|| self.head_search());
                 if (round - OPTIONS.first_head_round).is_multiple_of(OPTIONS.rounds_per_head) {
                     let within = |share: f64| (f64::from(round) + share) / f64::from(rounds);
-                    self.optimise_head(heads, recorder, spread_weights, &within)?;
+                    if self.optimise_head(heads, recorder, spread_weights, &within)? {
+                        head_round = round;
+                    }
                 }
-                self.propose_head(&heads.latest_weights());
+                self.propose_head(&heads.latest_weights(), head_round, round);
                 self.stand(recorder);
             }
             recorder.report(f64::from(round + 1) / f64::from(rounds));
@@ -197,7 +200,7 @@ impl<'a> Portfolio<'a> {
         }
     }
 
-    /// One more head, where there is to be one.
+    /// One more head, where there is to be one; whether there was.
     ///
     /// * `within`: share of the search that is done where this share of the head is
     fn optimise_head(
@@ -206,9 +209,9 @@ impl<'a> Portfolio<'a> {
         recorder: &mut Recorder,
         spread_weights: &dyn Fn(&[f64]) -> Vec<f32>,
         within: &dyn Fn(f64) -> f64,
-    ) -> Result<(), crate::network::Error> {
+    ) -> Result<bool, crate::network::Error> {
         if heads.is_over() {
-            return Ok(());
+            return Ok(false);
         }
         let begun = Instant::now();
         let SolveSettings { weights_every: every, iterations, .. } = *self.settings;
@@ -224,7 +227,7 @@ impl<'a> Portfolio<'a> {
         let stats = self.stats(Proposal::Network);
         stats.seconds += begun.elapsed().as_secs_f64();
         stats.work += work;
-        Ok(())
+        Ok(true)
     }
 
     /// Inliers that count as verified by geometry.

@@ -10,45 +10,59 @@ use crate::geometry::statistics::median;
 use crate::network::THRESHOLD;
 use crate::solver::a_contrario::{self, FalseAlarmOptions};
 use crate::solver::learned::TrackScores;
-use crate::solver::search::{Sampler, Seed, Shortlist, affine, rigid};
+use crate::solver::search::rigid::{Rigid, RigidSearch};
+use crate::solver::search::{Sampler, Seed, Shortlist, affine};
 use crate::solver::{depths, grow, priors};
 
-impl Portfolio<'_> {
+impl<'a> Portfolio<'a> {
     /// Whether this proposal may find anything yet.
     pub(super) fn is_wanted(&self, proposal: Proposal) -> bool {
         !self.is_over() && !self.stop.is_stopped() && !self.settings.excluded_proposals.contains(&proposal)
     }
 
-    /// Tracks whose distances stay the same, once a noise level: where depths are given and true up to one scale.
+    /// Whether a round is the first one at its noise since another round.
+    fn is_new_noise(since: u32, round: u32) -> bool {
+        let noise = |round: u32| OPTIONS.noise_ladder[round as usize % OPTIONS.noise_ladder.len()];
+        (since..round).all(|earlier| noise(earlier) != noise(round))
+    }
+
+    /// The search for rigid tracks, where depths are given and true up to one scale, and a proposal may use it; not of a
+    /// zoom, which moves distances with the focal length.
+    fn rigid_search(&self, proposal: Proposal) -> Option<RigidSearch<'a>> {
+        let is_wanted = self.is_wanted(proposal) && self.is_wanted(Proposal::Rigidity);
+        if !is_wanted || self.settings.focal_per_view {
+            return None;
+        }
+        RigidSearch::new(self.block, self.spread, self.stop)
+    }
+
+    /// Tracks whose distances stay the same, once a noise level.
     pub(super) fn propose_rigid(&mut self, round: u32) {
-        let is_new = OPTIONS
-            .noise_ladder
-            .iter()
-            .position(|level| *level == OPTIONS.noise_ladder[round as usize % OPTIONS.noise_ladder.len()])
-            == Some(round as usize);
-        // A zoom moves distances with the focal length.
-        if !is_new || self.settings.focal_per_view || !self.is_wanted(Proposal::Rigidity) {
+        if !Self::is_new_noise(0, round) {
             return;
         }
-        let Some(search) = rigid::RigidSearch::new(self.block, self.spread, self.stop) else { return };
-        let begun = Instant::now();
-        let found = search.run(self.noise);
+        let Some(search) = self.rigid_search(Proposal::Rigidity) else { return };
         let pairs = self.block.tracks() * (self.block.tracks() - 1) / 2;
-        let stats = self.stats(Proposal::Rigidity);
-        stats.seconds += begun.elapsed().as_secs_f64();
-        stats.work += pairs as u32;
-        let Some(rigid) = found else { return };
-        self.offer_rigid(Proposal::Rigidity, rigid, search.spread());
+        self.stats(Proposal::Rigidity).work += pairs as u32;
+        self.propose_rigid_consensus(Proposal::Rigidity, &search, |search, noise| search.run(noise));
     }
 
     /// A rigid consensus, grown by image points, and as depths verify it where that is not decisive.
-    ///
-    /// * `spread`: of the search that found it
-    fn offer_rigid(&mut self, proposal: Proposal, rigid: rigid::Rigid, spread: f64) {
+    fn propose_rigid_consensus(
+        &mut self,
+        proposal: Proposal,
+        search: &RigidSearch,
+        find: impl FnOnce(&RigidSearch, f64) -> Option<Rigid>,
+    ) {
+        let begun = Instant::now();
+        let found = find(search, self.noise);
+        self.stats(proposal).seconds += begun.elapsed().as_secs_f64();
+        let Some(rigid) = found else { return };
         self.verify(proposal, vec![depths::seed(&rigid)]);
+        let certainty = |rigid: &Rigid| rigid.ln_false_alarms(search.spread());
         if !self.is_decisive() {
             let found = Best {
-                ln_false_alarms: rigid.ln_false_alarms(spread),
+                ln_false_alarms: certainty(&rigid),
                 verified_by: VerifiedBy::Depths { focal: rigid.focal },
                 consensus: depths::consensus(self.block, &rigid, self.noise),
                 counted: rigid.inlier_count(),
@@ -57,24 +71,9 @@ impl Portfolio<'_> {
             self.stats(proposal).record(&found);
             self.offer(found);
         }
-        let certainty = |rigid: &rigid::Rigid| rigid.ln_false_alarms(spread);
-        let least = self.rigid.as_ref().map_or(FalseAlarmOptions::DEFAULT.ln_decisive, certainty);
+        let least = self.rigid.as_ref().map_or(FalseAlarmOptions::DEFAULT.ln_decisive, |(_, rigid)| certainty(rigid));
         if certainty(&rigid) < least {
-            self.rigid = Some(rigid);
-        }
-    }
-
-    /// A rigid consensus around tracks that a proposal keeps.
-    fn propose_rigid_around(&mut self, proposal: Proposal, kept: &[usize]) {
-        if self.settings.focal_per_view || !self.is_wanted(proposal) {
-            return;
-        }
-        let Some(search) = rigid::RigidSearch::new(self.block, self.spread, self.stop) else { return };
-        let begun = Instant::now();
-        let found = search.around(kept, self.noise);
-        self.stats(proposal).seconds += begun.elapsed().as_secs_f64();
-        if let Some(rigid) = found {
-            self.offer_rigid(proposal, rigid, search.spread());
+            self.rigid = Some((proposal, rigid));
         }
     }
 
@@ -177,10 +176,19 @@ impl Portfolio<'_> {
         self.verify(proposal, seeds);
     }
 
-    /// What a head keeps, grown as it stands, then searched from its ranking.
+    /// What a head keeps: once a noise level grown as it stands and by rigid distances, then searched from its ranking.
     ///
     /// * `weights`: of the head, one a track
-    pub(super) fn propose_head(&mut self, weights: &[f64]) {
+    /// * `since`: round that it was optimised in
+    pub(super) fn propose_head(&mut self, weights: &[f64], since: u32, round: u32) {
+        if Self::is_new_noise(since, round) {
+            self.propose_kept(weights);
+        }
+        self.propose(Proposal::Network, &priors::from_network(weights), None);
+    }
+
+    /// The tracks that a head keeps, as they are.
+    fn propose_kept(&mut self, weights: &[f64]) {
         let kept: Vec<usize> = (0..weights.len()).filter(|&track| weights[track] > THRESHOLD).collect();
         let seed = match &self.search {
             _ if kept.len() < RANK => None,
@@ -189,8 +197,9 @@ impl Portfolio<'_> {
                 .map(|basis| search.seed(self.block, &basis)),
         };
         self.verify(Proposal::Network, seed.into_iter().collect());
-        self.propose_rigid_around(Proposal::Network, &kept);
-        self.propose(Proposal::Network, &priors::from_network(weights), None);
+        if let Some(search) = self.rigid_search(Proposal::Network) {
+            self.propose_rigid_consensus(Proposal::Network, &search, |search, noise| search.around(&kept, noise));
+        }
     }
 
     /// Grows the tracks of most weight, without sampling.

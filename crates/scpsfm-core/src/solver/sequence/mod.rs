@@ -385,14 +385,12 @@ fn by_projective_extension(
             let grown = attempt.evidence(problem) / best.evidence(problem);
             is_part && grown < ExtensionOptions::DEFAULT.least_evidence_growth
         };
-        let noise = attempt.projective.as_ref().map_or(0.0, |found| found.noise);
-        let is_outweighed = |best: &Attempt| !attempt.is_by_depths() && best.outweighs_image_points_at(noise);
-        if best.as_ref().is_some_and(|best| is_known(best) || is_outweighed(best)) {
+        if best.as_ref().is_some_and(|best| is_known(best) || outweighs(best, &attempt)) {
             continue;
         }
         attempt::calibrate(problem, &mut attempt, &[], recorder)?;
         let rank = |attempt: &Attempt| (attempt.is_calibrated(), attempt.evidence(problem));
-        if best.as_ref().is_none_or(|best| rank(&attempt) > rank(best)) {
+        if best.as_ref().is_none_or(|best| outweighs(&attempt, best) || rank(&attempt) > rank(best)) {
             best = Some(attempt);
         }
         if best.as_ref().is_some_and(Attempt::is_good) {
@@ -402,17 +400,24 @@ fn by_projective_extension(
     Ok(best.or(unsolved))
 }
 
+/// Whether an attempt is verified by depths, and worth more than another that is not, see [`Attempt::outweighs`].
+fn outweighs(attempt: &Attempt, other: &Attempt) -> bool {
+    let of_other = other.projective.as_ref().filter(|_| !other.is_by_depths());
+    of_other.is_some_and(|other| attempt.outweighs(&other.views, other.noise))
+}
+
 /// Extends an attempt metrically where it has a metric reconstruction and that stands.
 ///
 /// An attempt without a calibration has the focal length that happens to fit best, which other views may refute: its
-/// extension stands only where it explains more than the projective reconstruction that it began from.
+/// extension stands only where it explains more than the projective reconstruction that it began from. One that depths
+/// outweigh does not stand, whatever it says of the calibration.
 fn metric_of(problem: &Problem, attempt: Attempt, recorder: &mut Recorder) -> Result<Ended, Error> {
     if !attempt.has_metric() || attempt.is_beyond_image_points() {
         return Ok(Ended::Block(Some(Box::new(attempt))));
     }
     let was_calibrated = attempt.is_calibrated();
     let mut extended = extend(problem, attempt, recorder)?;
-    if extended.seed.outweighs_image_points_at(extended.model.noise) {
+    if extended.seed.outweighs(&extended.model.registered(), extended.model.noise) {
         return Ok(Ended::Block(Some(Box::new(extended.seed))));
     }
     let explains_more = || extended.evidence(problem) > extended.seed.evidence(problem);
@@ -454,7 +459,7 @@ fn finished(problem: &Problem, mut attempt: Attempt, recorder: &mut Recorder) ->
 /// Extends what an attempt has found to all views and tracks, as far as image points verify it by themselves.
 ///
 /// * `keeps`: whether what was found stands where that leaves too little, else nothing does; what depths verify stands
-///   in any case
+///   in any case, and where it outweighs the extension, see [`Attempt::outweighs`]
 fn extend_projectively(
     problem: &Problem,
     attempt: &mut Attempt,
@@ -476,13 +481,12 @@ fn extend_projectively(
         options = GrowthOptions { gives_points: false, adjust_growth: f64::INFINITY, final_rounds: 1, ..options };
     }
     let extended = projective_growth::extend(problem, start, &options, recorder)?;
-    let is_outweighed = attempt.outweighs_image_points_at(extended.noise);
-    if extended.views.len() >= view_selection::LEAST_VIEWS && extended.tracks.len() >= least && !is_outweighed {
+    let is_enough = extended.views.len() >= view_selection::LEAST_VIEWS && extended.tracks.len() >= least;
+    attempt.projective = before;
+    if is_enough && !attempt.outweighs(&extended.views, extended.noise) {
         attempt.projective = Some(extended);
         attempt.verified_by_image_points();
-    } else if before.is_some() {
-        attempt.projective = before;
-    } else {
+    } else if attempt.projective.is_none() {
         // The reason is that of an attempt without a consensus.
         attempt.found.consensus = None;
     }

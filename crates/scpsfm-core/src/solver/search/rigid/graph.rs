@@ -56,7 +56,7 @@ impl Graph {
     }
 
     /// The focal lengths with most rigid pairs, no two of them neighbours on the grid.
-    pub fn best_focals(&self, count: usize) -> Vec<(f64, Edges)> {
+    pub fn best_focals(&self, count: usize) -> Vec<f64> {
         let scales: [f64; OPTIONS.focals] = std::array::from_fn(|k| Self::focal(k).powi(-2));
         let mut totals = [0usize; OPTIONS.focals];
         for pair in &self.pairs {
@@ -72,10 +72,11 @@ impl Graph {
                 chosen.push(k);
             }
         }
-        chosen.into_iter().map(|k| (Self::focal(k), self.edges(Self::focal(k)))).collect()
+        chosen.into_iter().map(Self::focal).collect()
     }
 
-    fn edges(&self, focal: f64) -> Edges {
+    /// Which pairs are rigid at a focal length.
+    pub fn edges(&self, focal: f64) -> Edges {
         let mut adjacent = vec![vec![false; self.tracks]; self.tracks];
         let order = (0..self.tracks).flat_map(|a| (a + 1..self.tracks).map(move |b| (a, b)));
         let g = focal.powi(-2);

@@ -126,7 +126,8 @@ impl<'a> RigidSearch<'a> {
         let all: Vec<usize> = (0..self.block.tracks()).collect();
         let graph = self.rigid_pairs(&all, noise)?;
         let mut best = None;
-        for (focal, edges) in graph.best_focals(OPTIONS.focals_grown) {
+        for focal in graph.best_focals(OPTIONS.focals_grown) {
+            let edges = graph.edges(focal);
             let mut covered = vec![false; all.len()];
             for _ in 0..OPTIONS.cores_grown {
                 let core = edges.core(&covered);
@@ -142,16 +143,18 @@ impl<'a> RigidSearch<'a> {
         best
     }
 
-    /// The best rigid consensus that grows from tracks that others chose.
+    /// The best rigid consensus that grows from tracks that were chosen otherwise, at the focal lengths at which most
+    /// pairs of them are rigid at this noise (normalised units); `None` where none grows. All of them are the core:
+    /// in noise that hides which pairs are rigid, the gate drops what is wrong as it tightens.
     ///
-    /// * `noise`: normalised units
-    pub fn around(&self, chosen: &[usize], noise: f64) -> Option<Rigid> {
-        if chosen.len() < LEAST_TRACKS {
+    /// * `tracks`: of the block
+    pub fn around(&self, tracks: &[usize], noise: f64) -> Option<Rigid> {
+        if tracks.len() < LEAST_TRACKS {
             return None;
         }
         let mut best = None;
-        for (focal, _) in self.rigid_pairs(chosen, noise)?.best_focals(OPTIONS.focals_grown) {
-            if self.improve(&mut best, focal, chosen, noise) {
+        for focal in self.rigid_pairs(tracks, noise)?.best_focals(OPTIONS.focals_grown) {
+            if self.improve(&mut best, focal, tracks, noise) {
                 break;
             }
         }
@@ -210,15 +213,15 @@ impl<'a> RigidSearch<'a> {
     }
 
     /// Statistics over the views of all pairs of some tracks, and how many are rigid at each focal length.
-    fn rigid_pairs(&self, of: &[usize], noise: f64) -> Option<Graph> {
-        let (views, tracks) = (self.block.views(), of.len());
+    fn rigid_pairs(&self, tracks: &[usize], noise: f64) -> Option<Graph> {
+        let (views, count) = (self.block.views(), tracks.len());
         let tolerance = self.median_depth * (OPTIONS.pair_tolerance * noise + OPTIONS.grid_tolerance);
-        let mut graph = Graph { tracks, tolerance, pairs: Vec::with_capacity(tracks * (tracks - 1) / 2) };
-        for (k, &a) in of.iter().enumerate() {
+        let mut graph = Graph { tracks: count, tolerance, pairs: Vec::with_capacity(count * (count - 1) / 2) };
+        for (k, &a) in tracks.iter().enumerate() {
             if self.stop.is_stopped() {
                 return None;
             }
-            for &b in &of[k + 1..] {
+            for &b in &tracks[k + 1..] {
                 let mut pair = Pair::default();
                 for view in 0..views {
                     let (first, second) = (self.block.point(view, a), self.block.point(view, b));
