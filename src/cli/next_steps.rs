@@ -14,7 +14,7 @@ const REMEDIES: [(WarningCode, &str); 15] = [
     (
         WarningCode::ModelMismatch,
         "if the camera zoomed, use --focal-per-view; if there were several cameras, make each a camera group \
-         (--view-table); else check the tracks",
+         (--view-table); else check the tracks, and the focal lengths if any were given",
     ),
     (WarningCode::Cheirality, "check the order of the views and the size of the images"),
     (WarningCode::LittleMotion, "add views that are taken from farther apart and turned against each other"),

@@ -23,6 +23,7 @@ mod depths;
 mod duplicates;
 mod fusion;
 pub(crate) mod grow;
+mod known_focal;
 pub(crate) mod learned;
 mod memory;
 mod near_duplicates;

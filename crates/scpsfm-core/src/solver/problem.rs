@@ -9,6 +9,7 @@ use super::attempt::AttemptOptions;
 use super::block::{self, Block};
 use super::calibration::CalibrationOptions;
 use super::grow::NoiseOptions;
+use super::known_focal::{KnownFocal, known_focal};
 use super::normalization::normalization;
 use super::view_selection::complete_views;
 use super::{Error, classification, near_duplicates, static_tracks};
@@ -159,7 +160,13 @@ impl<'a> Problem<'a> {
         };
         let calibration_options = CalibrationOptions::DEFAULT;
         let contradicted = calibration_options.grades.prior_contradicted;
-        warnings.extend(known.iter().flatten().filter_map(|known| known.contradiction(contradicted)));
+        for known in known.iter().flatten() {
+            let warning = known.contradiction(contradicted).map(|warning| match has_groups {
+                true => warning.of_group(input.views()[known.farthest].camera_group),
+                false => warning,
+            });
+            warnings.extend(warning);
+        }
         let representative: Vec<usize> = match is_searched(settings) {
             true => near_duplicates::representatives(&ranges, |k| input.view_of(k), &xy, initial_noise, stop),
             false => (0..input.track_count()).collect(),
@@ -366,68 +373,10 @@ pub fn observed_views(input: &Input) -> Vec<usize> {
     (0..seen.len()).filter(|&view| seen[view]).collect()
 }
 
-/// What is known beforehand of the one focal length of a camera.
-#[derive(Debug, Clone, PartialEq)]
-struct KnownFocal {
-    prior: FocalPrior,
-    /// Root mean square of the differences of its views' priors from their mean, in standard deviations of one.
-    deviations: f64,
-    /// The views with the least and the greatest focal length, and these in pixels.
-    extremes: [(usize, f64); 2],
-}
-
-/// What is known of the one focal length of these views, each with its number; `None` where nothing is.
-///
-/// The priors of one camera's views tell one piece of knowledge several times: their mean, weighted by information,
-/// has the standard deviation of one of them, not that of a mean. Where they differ, by so much more.
-fn known_focal<'a>(views: impl Iterator<Item = (usize, &'a View)>) -> Option<KnownFocal> {
-    let known: Vec<(usize, FocalPrior)> =
-        views.filter_map(|(number, view)| Some((number, view.focal_prior?))).collect();
-    let information = |prior: &FocalPrior| prior.sigma_log.powi(-2);
-    let total: f64 = known.iter().map(|(_, prior)| information(prior)).sum();
-    let weighted = |of: &dyn Fn(&FocalPrior) -> f64| {
-        known.iter().map(|(_, prior)| information(prior) * of(prior)).sum::<f64>() / total
-    };
-    let mean = weighted(&|prior| prior.focal_px.ln());
-    let spread = weighted(&|prior| (prior.focal_px.ln() - mean).powi(2));
-    let of_one = known.len() as f64 / total;
-    let by_focal = |a: &&(usize, FocalPrior), b: &&(usize, FocalPrior)| a.1.focal_px.total_cmp(&b.1.focal_px);
-    let extremes = [known.iter().min_by(by_focal)?, known.iter().max_by(by_focal)?];
-    Some(KnownFocal {
-        prior: FocalPrior { focal_px: mean.exp(), sigma_log: (of_one + spread).sqrt() },
-        deviations: (spread / of_one).sqrt(),
-        extremes: extremes.map(|(number, prior)| (*number, prior.focal_px)),
-    })
-}
-
-impl KnownFocal {
-    /// Says that the priors contradict each other, where they differ by more than so many standard deviations.
-    fn contradiction(&self, contradicted: f64) -> Option<Warning> {
-        let [(least, from), (greatest, to)] = self.extremes;
-        let detail = format!(
-            "the focal lengths known beforehand of one camera group differ by {:.1} standard deviations in rms, from \
-             {from:.1} px (view {least}) to {to:.1} px (view {greatest}); together they count as {:.1} px +- {:.0} %",
-            self.deviations,
-            self.prior.focal_px,
-            100.0 * self.prior.sigma_log
-        );
-        (self.deviations > contradicted).then(|| Warning::new(WarningCode::ModelMismatch, detail))
-    }
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
     use crate::domain::{Limits, RawInput};
-
-    fn known(views: &[Option<(f64, f64)>]) -> Option<KnownFocal> {
-        let view = |prior: &Option<(f64, f64)>| View {
-            focal_prior: prior.map(|(focal_px, sigma_log)| FocalPrior { focal_px, sigma_log }),
-            ..View::default()
-        };
-        let views: Vec<View> = views.iter().map(view).collect();
-        known_focal(views.iter().enumerate())
-    }
 
     /// Tracks all over the images, and as many again within a pixel of the first.
     #[test]
@@ -449,27 +398,5 @@ mod tests {
         };
         let (alone, among) = (density(0), density(60));
         assert!((among / alone - 1.0).abs() < 0.05, "{among} for {alone}");
-    }
-
-    #[test]
-    fn priors_of_several_views_are_one_piece_of_knowledge() {
-        assert_eq!(known(&[None, None]), None);
-        let same = known(&[Some((800.0, 0.1)), None, Some((800.0, 0.1))]).expect("a prior");
-        let FocalPrior { focal_px, sigma_log } = same.prior;
-        assert!((focal_px - 800.0).abs() < 1e-9 && (sigma_log - 0.1).abs() < 1e-12, "{same:?}");
-        assert_eq!(same.contradiction(3.0), None);
-        let vague = known(&[Some((800.0, 0.01)), Some((1600.0, 1.0))]).expect("a prior");
-        assert!((vague.prior.focal_px - 800.0).abs() < 1.0, "the vaguer one hardly counts: {vague:?}");
-        assert_eq!(vague.contradiction(3.0), None);
-    }
-
-    #[test]
-    fn priors_that_contradict_each_other_are_said_to() {
-        let torn = known(&[Some((1600.0, 0.01)), None, Some((800.0, 0.01))]).expect("a prior");
-        assert!((torn.prior.sigma_log - 0.5 * 2f64.ln()).abs() < 1e-3, "{torn:?}");
-        let warning = torn.contradiction(3.0).expect("a warning");
-        assert_eq!(warning.code, WarningCode::ModelMismatch);
-        let told = "from 800.0 px (view 2) to 1600.0 px (view 0); together they count as 1131.4 px +- 35 %";
-        assert!(warning.detail.ends_with(told), "{warning:?}");
     }
 }

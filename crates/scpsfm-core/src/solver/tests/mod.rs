@@ -145,6 +145,20 @@ fn depths_stand_where_image_points_hold_too_few_tracks() {
 }
 
 #[test]
+fn focal_priors_that_contradict_each_other_are_told_with_the_camera_group() {
+    let (_, scene) = scene(SceneOptions { views: 6, tracks: 60, outliers: 0.3, ..SceneOptions::default() });
+    let mut raw = scene.input.clone();
+    for (view, focal_px) in [(1, scene.truth.focal_px), (2, scene.truth.focal_px), (4, 2.0 * scene.truth.focal_px)] {
+        raw.views[view].focal_prior = Some(FocalPrior { focal_px, sigma_log: 0.02 });
+    }
+    let input = Input::new(raw, &Limits::default(), "priors").expect("valid");
+    let solution = solved(&input, &SolveSettings::default());
+    let told = solution.warnings.iter().find(|warning| warning.detail.contains("that of view 4")).expect("a warning");
+    assert_eq!((told.code, told.camera_group), (WarningCode::ModelMismatch, Some(0)), "{told:?}");
+    assert!(focal_error(&solution, &scene) < 0.1, "{:?}", solution.calibrations);
+}
+
+#[test]
 fn padding_changes_nothing() {
     // The paper pads its matrices to 300 x 1000.
     for with_depths in [false, true] {
