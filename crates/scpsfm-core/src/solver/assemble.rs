@@ -120,9 +120,9 @@ impl Reconstruction {
     ) -> Solution {
         warnings.extend(self.warnings.iter().cloned());
         let inliers = judged.tracks.inlier.iter().filter(|&&inlier| inlier).count();
-        // Depths verify fewer, and PAPER, SCPSFM and PSFM keep what they keep.
-        if seed.judges_observations() && inliers < LEAST_INLIERS {
-            let detail = format!("{inliers} tracks hold under the final geometry; {LEAST_INLIERS} can be verified");
+        let least = seed.least_inliers();
+        if inliers < least {
+            let detail = format!("{inliers} tracks hold under the final geometry; {least} can be verified");
             warnings.push(Warning::new(WarningCode::FewInliers, detail));
             return nothing(problem, Some(seed), warnings, recorder);
         }

@@ -8,6 +8,7 @@ use rand_chacha::ChaCha8Rng;
 use super::normalization::normalization;
 use crate::domain::Input;
 use crate::geometry::measurement::CompleteBlock;
+use crate::geometry::statistics::median;
 
 /// A set of views with the tracks that are seen in all of them.
 #[derive(Debug, Clone)]
@@ -53,7 +54,8 @@ pub fn of_all_views(input: &Input) -> Block {
     extract(input, &input.track_ranges(), xy, &(0..input.view_count()).collect::<Vec<_>>())
 }
 
-/// The block of these views: all tracks that are complete over them.
+/// The block of these views: all tracks that are complete over them, with their depths in a unit in which these are
+/// about 1.
 ///
 /// * `xy`: normalised image point of an observation
 pub fn extract(input: &Input, ranges: &[usize], xy: impl Fn(usize) -> Vector2<f64>, views: &[usize]) -> Block {
@@ -76,7 +78,16 @@ pub fn extract(input: &Input, ranges: &[usize], xy: impl Fn(usize) -> Vector2<f6
             }
         }
     }
+    let unit = unit_of(&depths);
+    depths.iter_mut().for_each(|depth| *depth /= unit);
     let depths = input.has_depths().then_some(depths);
     let complete = CompleteBlock::new(views.len(), tracks.len(), &points, depths);
     Block { views: views.to_vec(), tracks, complete }
+}
+
+/// The power of two nearest to the median size of depths, by which to divide changes no digit: callers may give them in
+/// any unit, of which positions and translations would have the size, and adjustment would lose its accuracy.
+fn unit_of(depths: &[f64]) -> f64 {
+    let mut sizes: Vec<f64> = depths.iter().map(|depth| depth.abs()).collect();
+    if sizes.is_empty() { 1.0 } else { median(&mut sizes).log2().round().exp2() }
 }

@@ -81,9 +81,8 @@ impl ContinuationOptions {
         first_gate_factor: 1.25,
         // Below, the exact rank of a set of five or six would shut every other track out; above, wrong ones pass.
         tolerance: (0.02, 0.25),
-        // Tracks that reach half of it on average do not stand apart any more: beyond, a consensus could not be told from
-        // a wrong one.
-        // Without it, all of 200 wrong tracks are kept in one of ten scenes without a right one.
+        // Tracks that reach half of it on average do not stand apart any more: beyond, a consensus could not be told
+        // from a wrong one. Without it, all of 200 wrong tracks are kept in one of ten scenes without a right one.
         wrong_share: 2.0 * SEPARATION,
         // 10 views and 200 tracks. Singular values of wrong columns grow as the square root of their number.
         reference_shape: 200.0 / 26.0,

@@ -16,7 +16,7 @@ use super::learned::TrackScores;
 use super::portfolio::{self, Found, Portfolio, VerifiedBy};
 use super::problem::Problem;
 use super::recorder::Recorder;
-use super::search::rigid::Rigid;
+use super::search::rigid::{LEAST_TRACKS, Rigid};
 use super::sequence::ProjectiveReconstruction;
 use super::{Error, all_tracks, near_duplicates, scpsfm, static_tracks, track_sampling};
 use crate::domain::{FocalPrior, Grade, Method, Stage, WarningCode};
@@ -105,6 +105,15 @@ impl Attempt {
     /// Whether depths verify it.
     pub fn is_by_depths(&self) -> bool {
         matches!(self.found.verified_by, VerifiedBy::Depths { .. })
+    }
+
+    /// Inliers that what verifies it can verify; 0 where the method keeps what it keeps (PAPER, SCPSFM, PSFM).
+    pub fn least_inliers(&self) -> usize {
+        match self.found.verified_by {
+            _ if self.decided.is_some() => 0,
+            VerifiedBy::ImagePoints => LEAST_INLIERS,
+            VerifiedBy::Depths { .. } => LEAST_TRACKS,
+        }
     }
 
     /// The rigid consensus behind it or beside it.

@@ -158,6 +158,44 @@ fn focal_priors_that_contradict_each_other_are_told_with_the_camera_group() {
     assert!(focal_error(&solution, &scene) < 0.1, "{:?}", solution.calibrations);
 }
 
+/// Depths of the wrong sign for a third of the tracks leave a rigid set that image points do not bear out.
+#[test]
+fn fewer_tracks_than_depths_can_verify_are_no_reconstruction() {
+    for seed in 0..3 {
+        let options = SceneOptions { outliers: 0.96, noise: 0.03, with_depths: true, seed, ..SceneOptions::default() };
+        let mut raw = scene(options).0.to_raw();
+        for (depth, track) in raw.depth.iter_mut().zip(&raw.track) {
+            *depth *= if track % 3 == 0 { -1.0 } else { 1.0 };
+        }
+        let solution = solved(&Input::new(raw, &Limits::default(), "signs").expect("valid"), &SolveSettings::default());
+        let inliers = solution.tracks.inlier.iter().filter(|&&inlier| inlier).count();
+        let is_solved = solution.status == Status::Solved;
+        assert!(!is_solved || inliers >= 4, "seed {seed}: {inliers} inliers, {:?}", solution.warnings);
+    }
+}
+
+#[test]
+fn the_unit_of_depths_changes_nothing() {
+    let options = SceneOptions { outliers: 0.9, noise: 0.003, with_depths: true, seed: 3, ..SceneOptions::default() };
+    let (input, _) = scene(options);
+    for method in [Method::Auto, Method::Scpsfm] {
+        let settings = SolveSettings { iterations: 200, ..SolveSettings::of_method(method) };
+        let expected = solved(&input, &settings);
+        for factor in [2f64.powi(-60), 2f64.powi(60), 1e10] {
+            let mut raw = input.to_raw();
+            raw.depth.iter_mut().for_each(|depth| *depth *= factor);
+            let found = solved(&Input::new(raw, &Limits::default(), "scaled").expect("valid"), &settings);
+            assert_eq!((found.status, found.grade), (expected.status, expected.grade), "{method:?}, {factor:e}");
+            assert_eq!(found.tracks.inlier, expected.tracks.inlier, "{method:?}, {factor:e}");
+            let apart = (found.reprojection_rms_px.unwrap_or(0.0) / expected.reprojection_rms_px.unwrap_or(1.0)).ln();
+            assert!(apart.abs() < 1e-3, "{method:?}, {factor:e}: {apart}");
+            if factor != 1e10 {
+                assert_eq!(found.views, expected.views, "{method:?}, {factor:e}");
+            }
+        }
+    }
+}
+
 #[test]
 fn padding_changes_nothing() {
     // The paper pads its matrices to 300 x 1000.

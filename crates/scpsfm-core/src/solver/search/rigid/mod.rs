@@ -26,7 +26,7 @@ use crate::solver::a_contrario::ln_false_alarms_of;
 
 const OPTIONS: RigidOptions = RigidOptions::DEFAULT;
 /// Tracks that leave six unknowns a view determined, with one to verify.
-const LEAST_TRACKS: usize = 4;
+pub const LEAST_TRACKS: usize = 4;
 
 /// A rigid shape with the tracks that belong to it.
 #[derive(Debug, Clone)]
