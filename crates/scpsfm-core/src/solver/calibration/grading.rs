@@ -59,8 +59,7 @@ pub(super) fn grade(
                 let of_focal = sigmas.of_group[group][Parameter::LogFocal as usize];
                 let mut sigma = of_focal.filter(|sigma| *sigma < grades.unobservable_above);
                 if let Some(focal_prior) = choice.problem.focal_priors[group] {
-                    let of_data = of_data(&best, group, comparison.inflation);
-                    weigh_prior(&mut verdict, &mut sigma, choice, &best, group, of_data, focal_prior);
+                    weigh_prior(&mut verdict, &mut sigma, choice, &best, group, &comparison, focal_prior);
                 }
                 verdict.judge_sigma(sigma);
                 (of_focal, sigma)
@@ -197,32 +196,42 @@ fn of_data(best: &Candidate, group: usize, inflation: f64) -> Option<f64> {
 /// Where it contradicts them, sigma grows by as many standard deviations (Birge's ratio of two values): one of the two
 /// is wrong, and which is not known.
 ///
-/// * `of_data`: standard deviation by the observations alone
+/// * `comparison`: of the best with projective cameras
 fn weigh_prior(
     verdict: &mut Verdict,
     sigma: &mut Option<f64>,
     choice: &Choice,
     best: &Candidate,
     group: usize,
-    of_data: Option<f64>,
+    comparison: &Comparison,
     focal_prior: FocalPrior,
 ) {
+    let of_data = of_data(best, group, comparison.inflation);
     // It lifts the grade by one step at most.
     if of_data.is_none_or(|of_data| of_data > choice.problem.options.grades.weak_up_to) {
         verdict.grade = verdict.grade.worse(Grade::Weak);
     }
-    let (Some(of_data), Some(optimum)) = (of_data, best.optimum(best.model, &without_focal(best, group))) else {
-        return;
+    let alone = without_focal(best, group);
+    let contradicts = |difference: f64, of_data: f64| {
+        let deviations = difference.abs() / of_data.hypot(focal_prior.sigma_log);
+        Some(deviations).filter(|deviations| *deviations > choice.problem.options.grades.prior_contradicted)
     };
-    let shift = optimum.shift_of(group, Parameter::LogFocal);
-    let intrinsics = &best.minimum.reconstruction.intrinsics[group];
-    let difference = best.priors[group].deviation(Parameter::LogFocal, intrinsics) + shift;
-    let deviations = difference.abs() / of_data.hypot(focal_prior.sigma_log);
-    if deviations > choice.problem.options.grades.prior_contradicted {
+    let optimum = best.optimum(best.model, &alone).filter(|_| !comparison.is_misfit(&choice.problem.options.fit));
+    if let (Some(of_data), Some(optimum)) = (of_data, optimum) {
+        let known = best.priors[group].deviation(Parameter::LogFocal, &best.minimum.reconstruction.intrinsics[group]);
+        if contradicts(known + optimum.shift_of(group, Parameter::LogFocal), of_data).is_none() {
+            return;
+        }
+    }
+    // Far from what the observations say, nothing fits, and they do not tell to second order where that is.
+    let freed = choice.search(&alone).converged(best.minimum.reconstruction.clone(), best.model);
+    let freed = Candidate::new(freed, best.model, alone, choice.problem);
+    let focal_px = freed.minimum.reconstruction.intrinsics[group].focal * choice.scale_px;
+    let Some(of_data) = freed.sigma(group, Parameter::LogFocal, freed.model, &freed.priors) else { return };
+    if let Some(deviations) = contradicts((focal_px / focal_prior.focal_px).ln(), of_data) {
         let detail = format!(
-            "the tracks alone give a focal length of {:.1} px, {deviations:.1} standard deviations from the {:.1} px \
-             known beforehand",
-            intrinsics.focal * shift.exp() * choice.scale_px,
+            "the tracks alone give a focal length of {focal_px:.1} px, {deviations:.1} standard deviations from the \
+             {:.1} px known beforehand",
             focal_prior.focal_px
         );
         verdict.warnings.push(Warning::new(WarningCode::ModelMismatch, detail));

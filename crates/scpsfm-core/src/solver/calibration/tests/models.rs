@@ -185,6 +185,23 @@ fn a_prior_helps_where_the_motion_says_little_and_is_contradicted_where_it_says_
     }
 }
 
+/// However far away what the tracks say is.
+#[test]
+fn what_the_tracks_say_against_a_prior_is_what_they_say_without_it() {
+    for seed in 0..5 {
+        let scene = testing::scene(seed, 10, 60, 0.001);
+        let alone = calibrated(&scene, seed, 0.001).intrinsics().expect("a calibration").focal * SIDE_PX;
+        let off = FocalPrior { focal_px: scene.intrinsics.focal * SIDE_PX * 0.6, sigma_log: 0.001 };
+        let outcome = calibrated_knowing(&scene, seed, 0.001, Some(off));
+        let told = outcome.warnings.iter().find_map(|warning| {
+            let figure = warning.detail.strip_prefix("the tracks alone give a focal length of ")?;
+            figure.split(' ').next()?.parse::<f64>().ok()
+        });
+        let told = told.unwrap_or_else(|| panic!("seed {seed}: {:?}", outcome.warnings));
+        assert!((told / alone).ln().abs() < 0.02, "seed {seed}: {told} for {alone}, {:?}", outcome.warnings);
+    }
+}
+
 #[test]
 fn an_orbit_about_one_axis_leaves_the_principal_point_open() {
     for seed in 0..5 {
