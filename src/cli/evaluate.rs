@@ -58,7 +58,7 @@ Columns of the table, of the cells by seeds and method:
                were kept; median over the seeds that reconstruct something
   focal %      |log(f / true f)| in per cent, median over the seeds that give a focal length
   seconds      median of a solve; with several threads or other work on the machine it is longer
-More, in summary.csv: 3D error, ratio of the focal error to the oracle's, grades; 95 % intervals of these, F1 and errors.
+More, in summary.csv: 3D error, ratio of the focal error to the oracle's, grades; 95 % intervals of F1 and the errors.
 Of --priors: AP, the average precision of the ranking by a prior alone; F1 and s after 600, 6,000 and 60,000 samples;
 verified, ranked, none: answers of AUTO by kind; AP rank, of the ranked ones.";
 

@@ -47,8 +47,8 @@ impl KnownFocal {
     pub fn contradiction(&self, contradicted: f64) -> Option<Warning> {
         let FocalPrior { focal_px, sigma_log } = self.prior;
         let detail = format!(
-            "the focal lengths that were given for views of one camera contradict each other: that of view {}, {:.1} px, \
-             is {:.1} of its standard deviations from their mean; together they count as {focal_px:.1} px +- {:.0} %",
+            "the focal lengths that were given for views of one camera contradict each other: that of view {}, {:.1} \
+             px, is {:.1} of its standard deviations from their mean; together they count as {focal_px:.1} px +- {:.0} %",
             self.farthest,
             self.farthest_px,
             self.deviations,

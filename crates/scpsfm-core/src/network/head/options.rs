@@ -44,9 +44,9 @@ pub struct ContinuationOptions {
     pub leak: f64,
 }
 
-/// Wrong consensuses leave about as much as they were selected by; right ones, noise. Photographs have wrong tracks near
-/// right ones: of one window of ten, 40 % of the observations that were kept were wrong where the gate was not held
-/// below this, and 6 % are.
+/// Wrong consensuses leave about as much as they were selected by; right ones, noise. Photographs have wrong tracks
+/// near right ones: of one window of ten views, 40 % of the observations that were kept were wrong where the gate was
+/// not held below this, and 6 % are.
 const SEPARATION: f64 = 0.4;
 
 impl ContinuationOptions {

@@ -3,8 +3,8 @@
 //! What is cheap goes first: rigid distances where depths are given, the scores of the network that was trained
 //! beforehand, reweighting, consistency, and uniform sampling, which needs no ranking to be right. Where they decide
 //! nothing, heads of the paper's network are optimised ([`super::scpsfm`]), and what each keeps is verified by
-//! geometry, by rigid distances, too. A decisive consensus ends the search: a head takes longer than everything else. Each proposal's own time
-//! is kept.
+//! geometry, by rigid distances, too. A decisive consensus ends the search: a head takes longer than everything else.
+//! Each proposal's own time is kept.
 
 mod best;
 mod options;

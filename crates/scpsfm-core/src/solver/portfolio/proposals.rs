@@ -26,8 +26,8 @@ impl<'a> Portfolio<'a> {
         (since..round).all(|earlier| noise(earlier) != noise(round))
     }
 
-    /// The search for rigid tracks, where depths are given and true up to one scale, and a proposal may use it; not of a
-    /// zoom, which moves distances with the focal length.
+    /// The search for rigid tracks, where depths are given and true up to one scale, and a proposal may use it; not of
+    /// a zoom, which moves distances with the focal length.
     fn rigid_search(&self, proposal: Proposal) -> Option<RigidSearch<'a>> {
         let is_wanted = self.is_wanted(proposal) && self.is_wanted(Proposal::Rigidity);
         if !is_wanted || self.settings.focal_per_view {

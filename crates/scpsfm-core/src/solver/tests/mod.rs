@@ -115,8 +115,8 @@ fn strong_noise_is_judged_by_depths_too() {
     assert!(by_depths > 0.9 && by_depths > by_image, "mean F1 {by_depths} with depths, {by_image} without");
 }
 
-/// In noise this strong dozens of wrong tracks fit some plane, and image points alone take that for the scene (seeds 2, 3
-/// and 5). Rigid distances find nothing at seed 1, where a head of the network keeps the right tracks.
+/// In noise this strong dozens of wrong tracks fit some plane, and image points alone take that for the scene (seeds 2,
+/// 3 and 5). Rigid distances find nothing at seed 1, where a head of the network keeps the right tracks.
 #[test]
 fn eight_right_tracks_in_strong_noise_are_told_by_depths() {
     let proposals = [(1, Proposal::Network), (2, Proposal::Rigidity), (3, Proposal::Rigidity), (5, Proposal::Rigidity)];
