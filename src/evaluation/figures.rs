@@ -24,7 +24,7 @@ const MOST_DECADES: f64 = 4.0;
 struct Measure {
     label: &'static str,
     of: fn(&Cell) -> Option<f64>,
-    /// Where it lies with a probability of 95 %.
+    /// Its 95 % bootstrap interval.
     interval: fn(&Cell) -> Option<[f64; 2]>,
     /// Fixed bounds of a linear axis; `None`: logarithmic, by the values.
     bounds: Option<(f64, f64)>,

@@ -228,7 +228,9 @@ fn weigh_prior(
     let freed = Candidate::new(freed, best.model, alone, choice.problem);
     let focal_px = freed.minimum.reconstruction.intrinsics[group].focal * choice.scale_px;
     let Some(of_data) = freed.sigma(group, Parameter::LogFocal, freed.model, &freed.priors) else { return };
-    if let Some(deviations) = contradicts((focal_px / focal_prior.focal_px).ln(), of_data) {
+    // What is left of the misfit without the prior is not its doing.
+    let inflation = (comparison.inflation * freed.fit.noise / best.fit.noise).max(1.0);
+    if let Some(deviations) = contradicts((focal_px / focal_prior.focal_px).ln(), inflation * of_data) {
         let detail = format!(
             "the tracks alone give a focal length of {focal_px:.1} px, {deviations:.1} standard deviations from the \
              {:.1} px known beforehand",
