@@ -10,6 +10,7 @@ use sha2::{Digest, Sha256};
 
 use super::args::cores;
 use super::evaluate_choices::{ContestantArg, DepthsArg, SweepArg};
+use super::evaluate_long::{self, LongArgs};
 use super::evaluate_observations::{self, ObservationArgs};
 use super::evaluate_photographed::{self, PhotographedArgs};
 use super::evaluate_priors::{self, PriorArgs, Work};
@@ -44,6 +45,7 @@ Examples:
   scpsfm evaluate --priors --seeds 20 --out priors
   scpsfm evaluate --observations --scenes complete --out observations
   scpsfm evaluate --photographed --seeds 40 --scenes fisheye --out photographed
+  scpsfm evaluate --long --scenes drive --out long
   scpsfm evaluate --real sequences --peer 'python peer.py' --out side-by-side
 
 Files in the output directory: runs.jsonl (every run, one a line), summary.csv and summary.json (one entry a cell), \
@@ -73,7 +75,7 @@ pub struct Args {
     #[arg(long, value_name = "DIR", default_value = "scpsfm-evaluation")]
     pub out: PathBuf,
 
-    /// Scenes a cell [default: 20, with --quick 4, with --photographed 300 in all]
+    /// Scenes a cell [default: 20, with --quick 4, with --photographed 300 in all, with --long 1]
     #[arg(long, value_name = "N", value_parser = clap::value_parser!(u64).range(1..=10_000))]
     pub seeds: Option<u64>,
 
@@ -129,6 +131,9 @@ pub struct Args {
 
     #[command(flatten)]
     pub photographed: PhotographedArgs,
+
+    #[command(flatten)]
+    pub long: LongArgs,
 
     #[command(flatten)]
     pub real: RealArgs,
@@ -208,6 +213,12 @@ pub async fn run(args: Args) -> Result<Exit, Failure> {
         let (scenes, peer) = (args.priors.scenes.as_deref(), args.real.peer_words()?);
         let seeds = args.seeds.unwrap_or(evaluate_photographed::SEEDS);
         return evaluate_photographed::run(scenes, seeds, peer, &work, args.json);
+    }
+    if args.long.long {
+        // One after the other: the memory is that of one solve.
+        let work = Work { out: &args.out, threads: 1, quiet: args.quiet };
+        let seeds = args.seeds.unwrap_or(evaluate_long::SEEDS);
+        return evaluate_long::run(args.priors.scenes.as_deref(), seeds, &work, args.json);
     }
     if args.priors.priors {
         return evaluate_priors::run(&args.priors, &args.out, seeds, threads, args.json, args.quiet).await;
@@ -362,6 +373,17 @@ mod tests {
             assert!(parse(&["--paper-width", wrong]).is_err(), "{wrong}");
         }
     }
+
+    #[test]
+    fn long_sequences_are_solved_one_after_the_other() {
+        assert!(parse(&["--long", "--seeds", "2", "--scenes", "drive"]).is_ok());
+        let others: [&[&str]; 4] = [&["--threads", "2"], &["--photographed"], &["--real", "sequences"], &["--quick"]];
+        for more in others {
+            let error = parse(&[&["--long"], more].concat()).err().unwrap_or_else(|| panic!("{more:?}"));
+            assert!(error.to_string().contains("--long"), "{error}");
+        }
+    }
+
     #[test]
     fn photographed_scenes_are_a_suite_of_their_own() {
         assert!(parse(&["--photographed", "--seeds", "3", "--scenes", "orbit", "--peer", "peer"]).is_ok());

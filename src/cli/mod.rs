@@ -20,6 +20,7 @@ pub mod delete;
 pub mod demo;
 pub mod evaluate;
 pub mod evaluate_choices;
+pub mod evaluate_long;
 pub mod evaluate_observations;
 pub mod evaluate_photographed;
 mod evaluate_priors;

@@ -130,6 +130,14 @@ pub struct Measured {
     pub kept: usize,
     pub wanted: usize,
     pub due: usize,
+    /// Observations of the input.
+    pub given: usize,
+    /// Absolute trajectory error of the largest reconstruction over the length of the true path, where it is metric and
+    /// the truth is known.
+    pub trajectory_error: Option<f64>,
+    /// Largest memory of this process during the solve, with what other solves beside it hold; `None` where the system
+    /// does not tell.
+    pub peak_bytes: Option<u64>,
 }
 
 /// What either side says of an input.
@@ -144,6 +152,8 @@ struct Answer {
     mismatch: bool,
     second_structure: bool,
     seconds: f64,
+    trajectory_error: Option<f64>,
+    peak_bytes: Option<u64>,
 }
 
 impl Measured {
@@ -158,6 +168,8 @@ impl Measured {
             mismatch: answer.mismatch,
             second_structure: answer.second_structure,
             seconds: answer.seconds,
+            trajectory_error: answer.trajectory_error,
+            peak_bytes: answer.peak_bytes,
             kept: count(&answer.observations),
             ..Self::without_answer(sample)
         }
@@ -169,6 +181,7 @@ impl Measured {
             bound: sample.bounds.as_ref().and_then(|bounds| bounds.iter().copied().reduce(f64::max)),
             wanted: count(&sample.wanted),
             due: count(&sample.due),
+            given: sample.right.len(),
             ..Self::default()
         }
     }
@@ -200,7 +213,8 @@ pub struct Focals {
 }
 
 impl Focals {
-    fn of<'a>(focals: impl Iterator<Item = &'a FocalError>) -> Self {
+    /// Of these.
+    pub fn of<'a>(focals: impl Iterator<Item = &'a FocalError>) -> Self {
         let focals: Vec<&FocalError> = focals.collect();
         let some = |mut values: Vec<f64>| (!values.is_empty()).then(|| median(&mut values));
         let errors: Vec<f64> = focals.iter().map(|focal| focal.log_error.abs()).collect();

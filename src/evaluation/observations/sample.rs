@@ -1,5 +1,6 @@
 //! Inputs with their truth.
 
+use nalgebra::Vector3;
 use scpsfm_core::evaluation::bound;
 use serde::{Deserialize, Serialize};
 
@@ -60,9 +61,10 @@ impl Generator {
                 let views = input.view.iter().zip(&wanted).filter(|(_, wanted)| **wanted);
                 views.for_each(|(&view, _)| of_view[view as usize] += 1);
                 let due = of_view.into_iter().map(|count| count >= REGISTRABLE).collect();
+                let centres = Some(truth.centres());
                 let right = truth.observation_right;
                 let sample = Sample::new(IMAGE_SIZE, input, truth.inlier, right, truth.focals_px);
-                Sample { bounds, wanted, due, ..sample }
+                Sample { bounds, wanted, due, centres, ..sample }
             }
         })
     }
@@ -86,13 +88,16 @@ pub struct Sample {
     pub focals_px: Vec<f64>,
     /// Cramer-Rao bound of the standard deviation of each view's log focal length, where it is known.
     pub bounds: Option<Vec<f64>>,
+    /// Where the camera of each view is, where it is known.
+    pub centres: Option<Vec<Vector3<f64>>>,
 }
 
 impl Sample {
     /// Of all views, and of the right observations of right tracks, an answer is expected; no bound is known.
     fn new(size: ImageSize, input: RawInput, inlier: Vec<bool>, right: Vec<bool>, focals_px: Vec<f64>) -> Self {
         let wanted = right.iter().zip(&input.track).map(|(&right, &k)| right && inlier[k as usize]).collect();
-        Self { size, due: vec![true; input.views.len()], input, inlier, right, wanted, focals_px, bounds: None }
+        let due = vec![true; input.views.len()];
+        Self { size, due, input, inlier, right, wanted, focals_px, bounds: None, centres: None }
     }
 
     /// True focal length of each view and the bound of its estimate.

@@ -5,6 +5,9 @@ use std::collections::HashSet;
 use std::process::Command;
 use std::time::Duration;
 
+use nalgebra::{Matrix3, Vector3};
+use scpsfm_core::evaluation::measures;
+
 use super::{Answer, Declared, FocalError, Sample};
 use crate::domain::result::ViewResult;
 use crate::domain::{Grade, Input, Limits, Silent, Solution, SolveSettings, StopToken, WarningCode};
@@ -21,6 +24,7 @@ const PEER_SECONDS: u64 = 600;
 pub fn ours(sample: &Sample, declared: Declared, stop: &StopToken) -> Result<Option<Answer>, String> {
     let input = Input::new(sample.input.clone(), &Limits::default(), "scene").map_err(|error| error.to_string())?;
     let settings = SolveSettings { focal_per_view: declared == Declared::FocalPerView, ..SolveSettings::default() };
+    let is_own_peak = child::forget_peak_memory();
     let begun = child::thread_cpu_seconds();
     let solution = match solver::solve(&input, &settings, &mut Silent, stop) {
         Ok(solution) => solution,
@@ -38,6 +42,8 @@ pub fn ours(sample: &Sample, declared: Declared, stop: &StopToken) -> Result<Opt
         mismatch: warns(WarningCode::ModelMismatch),
         second_structure: warns(WarningCode::SecondStructure),
         seconds: spent.unwrap_or(solution.seconds),
+        trajectory_error: trajectory_error(sample, &solution, &registered),
+        peak_bytes: is_own_peak.then(child::peak_memory).flatten(),
         tracks: solution.tracks.inlier,
         observations: solution.observations.inlier,
     }))
@@ -46,6 +52,22 @@ pub fn ours(sample: &Sample, declared: Declared, stop: &StopToken) -> Result<Opt
 fn views_of(solution: &Solution, part: u32) -> impl Iterator<Item = usize> {
     let of_part = move |(_, view): &(usize, &ViewResult)| view.projection.is_some() && view.part == part;
     solution.views.iter().enumerate().filter(of_part).map(|(index, _)| index)
+}
+
+/// Absolute trajectory error of these views over the length of their true path; `None` where the truth is not known, or
+/// nothing is metric.
+fn trajectory_error(sample: &Sample, solution: &Solution, registered: &[usize]) -> Option<f64> {
+    let truth = sample.centres.as_ref()?;
+    let centre = |&view: &usize| {
+        let ViewResult { rotation, translation, .. } = &solution.views[view];
+        let rows = (*rotation)?;
+        let rotation = Matrix3::from_fn(|row, column| rows[row][column]);
+        Some(-(rotation.tr_mul(&Vector3::from((*translation)?))))
+    };
+    let (found, truth): (Vec<Vector3<f64>>, Vec<Vector3<f64>>) =
+        registered.iter().filter_map(|view| Some((centre(view)?, truth[*view]))).unzip();
+    let path_length: f64 = truth.windows(2).map(|pair| (pair[1] - pair[0]).norm()).sum();
+    measures::rms_after_alignment(&found, &truth).map(|rms| rms / path_length).filter(|error| error.is_finite())
 }
 
 /// So many of the views that shall be registered, as a share.

@@ -205,6 +205,16 @@ fn in_group(pid: u32, group: u32) -> bool {
     Stat::read(pid).is_some_and(|stat| stat.group == group)
 }
 
+/// Sets the high-water mark of this process's memory back to what it holds; `false` where the system does not do that.
+pub fn forget_peak_memory() -> bool {
+    fs::write("/proc/self/clear_refs", "5").is_ok()
+}
+
+/// High-water mark of this process's memory in bytes; `None` where the system does not tell.
+pub fn peak_memory() -> Option<u64> {
+    Some(1024 * peak_kb(std::process::id())?)
+}
+
 /// High-water mark of the resident memory; `None` of a process that has ended.
 fn peak_kb(pid: u32) -> Option<u64> {
     let status = fs::read_to_string(format!("/proc/{pid}/status")).ok()?;

@@ -7,7 +7,7 @@ use serde::Serialize;
 
 use super::Sequence;
 use crate::synthetic::metrics::agreement;
-use scpsfm_core::evaluation::measures::aligned;
+use scpsfm_core::evaluation::measures::rms_after_alignment;
 
 /// Centres that a similarity must be held by: with three, its seven unknowns stand against nine equations.
 const LEAST_CENTRES: usize = 3;
@@ -124,11 +124,7 @@ fn centre_error(found: &BTreeMap<u64, Vector3<f64>>, known: &[Option<Vector3<f64
     if from.len() < LEAST_CENTRES || extent == 0.0 {
         return (None, from.len());
     }
-    let error = aligned(&from, &to).map(|moved| {
-        let sum: f64 = moved.iter().zip(&to).map(|(moved, to)| (moved - to).norm_squared()).sum();
-        (sum / to.len() as f64).sqrt() / extent
-    });
-    (error, from.len())
+    (rms_after_alignment(&from, &to).map(|rms| rms / extent), from.len())
 }
 
 /// Largest distance between two of the points.

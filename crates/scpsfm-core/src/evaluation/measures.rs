@@ -170,6 +170,13 @@ pub fn error_3d(found: &[Vector3<f64>], truth: &[Vector3<f64>]) -> Option<f64> {
     mean.is_finite().then_some(mean)
 }
 
+/// Root mean square distance of points from the true ones after the best similarity; `None` where [`aligned`] has none.
+/// Of camera centres it is the absolute trajectory error.
+pub fn rms_after_alignment(found: &[Vector3<f64>], truth: &[Vector3<f64>]) -> Option<f64> {
+    let squared = aligned(found, truth)?.into_iter().zip(truth).map(|(found, truth)| (found - truth).norm_squared());
+    Some((squared.sum::<f64>() / truth.len() as f64).sqrt())
+}
+
 /// The points moved onto `truth` by the similarity of least squares (Umeyama 1991); `None` for fewer than three points,
 /// or where nothing finite comes of it.
 pub fn aligned(points: &[Vector3<f64>], truth: &[Vector3<f64>]) -> Option<Vec<Vector3<f64>>> {
@@ -204,6 +211,8 @@ mod tests {
         let error = error_3d(&wrong, &truth).expect("four points");
         assert!(error > 0.005 && error < 0.2, "{error}");
         assert_eq!(error_3d(&moved[..2], &truth[..2]), None);
+        assert!(rms_after_alignment(&moved[1..], &truth[1..]).expect("three points") < 1e-12);
+        assert!(rms_after_alignment(&wrong, &truth).expect("four points") > 0.005);
         assert_eq!(error_3d(&[Vector3::repeat(f64::NAN); 4], &truth), None);
     }
 

@@ -5,6 +5,7 @@
 
 mod draw;
 mod lens;
+pub mod long;
 mod motion;
 mod noise;
 mod options;
@@ -16,7 +17,7 @@ mod tests;
 mod visibility;
 mod wrong;
 
-use nalgebra::Vector3;
+use nalgebra::{Matrix3, Vector3};
 use serde::{Deserialize, Serialize};
 
 pub use self::noise::effective_noise;
@@ -55,6 +56,16 @@ pub struct PhotographedTruth {
 }
 
 impl PhotographedTruth {
+    /// Where the camera of each view is, in the world.
+    pub fn centres(&self) -> Vec<Vector3<f64>> {
+        let poses = self.rotations.iter().zip(&self.translations);
+        let centre = |(rotation, translation): (&[[f64; 3]; 3], &[f64; 3])| {
+            let rotation = Matrix3::from_fn(|row, column| rotation[row][column]);
+            -(rotation.tr_mul(&Vector3::from(*translation)))
+        };
+        poses.map(centre).collect()
+    }
+
     /// Whether each observation is right and of a track with [`VERIFIABLE`] right ones.
     ///
     /// * `track`: the track of each observation

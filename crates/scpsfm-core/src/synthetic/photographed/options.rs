@@ -137,7 +137,7 @@ pub struct PhotographedOptions {
 impl PhotographedOptions {
     /// Views and tracks that one scene may have, so that a slip of the finger does not fill the memory.
     pub const MAX_VIEWS: usize = 1_000;
-    pub const MAX_TRACKS: usize = 100_000;
+    pub const MAX_TRACKS: usize = 200_000;
 
     /// The scene in a line: its motion, lens, focal lengths, visibility and what is wrong.
     pub fn name(&self) -> String {
