@@ -110,8 +110,8 @@ fn of_blocks(problem: &Problem, recorder: &mut Recorder) -> Result<Ended, Error>
         ControlFlow::Continue(ended) => ended.seed(),
     };
     let subsets = view_selection::subsets(&blocks.sets);
-    let cheap =
-        if blocks.is_whole { ExtensionOptions::DEFAULT.first_subsets.min(subsets.len()) } else { subsets.len() };
+    let is_short = blocks.is_whole || metric.is_some();
+    let cheap = if is_short { ExtensionOptions::DEFAULT.first_subsets.min(subsets.len()) } else { subsets.len() };
     let (cheap, rest) = subsets.split_at(cheap);
     // Nothing else is searched of a whole input with depths: what it has found stands.
     let mut best = by_projective_extension(problem, None, starts(first, !is_quick, cheap), recorder)?;
