@@ -46,6 +46,13 @@ pub fn text(solution: &Solution, input: Option<&LabelledInput>) -> String {
         0 => {}
         count => fact("unclassified", format!("{count} tracks: fewer than {VERIFIED} registered views see them")),
     }
+    if !solution.two_view_tracks.is_empty() {
+        let count = solution.two_view_tracks.len();
+        fact(
+            "two views",
+            format!("{count} tracks that two views of a part see are consistent with these; none is verified"),
+        );
+    }
     if !solution.splits.is_empty() {
         fact("splits", format!("{} further points in tracks that join several", solution.splits.len()));
     }

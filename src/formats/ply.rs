@@ -1,4 +1,5 @@
-//! Points as PLY: those of the inlier tracks of one part in `points.ply`, coloured by weight, and those of a model.
+//! Points as PLY: those of the inlier tracks of one part in `points.ply` and those that two views see in
+//! `points-two-view.ply`, coloured by weight, and those of a model.
 
 use std::fmt::Write;
 
@@ -32,11 +33,32 @@ pub fn points(solution: &Solution, input: Option<&LabelledInput>, part: u32) -> 
     } else {
         "projective (pixels, frame P1 = [I|0] of the first registered view): no distances, no angles"
     };
+    weighted(&format!("scpsfm points{which}, {frame}, coloured by weight"), "split", vertices, input)
+}
+
+/// The points of the tracks that two views see, of all parts; `None` where there are none. A vertex is as in
+/// [`points`], with the part in place of the split.
+pub fn two_view_points(solution: &Solution, input: Option<&LabelledInput>) -> Option<String> {
+    let found = solution.two_view_tracks.iter();
+    let vertices: Vec<(usize, u32, f32, [f64; 3])> =
+        found.filter_map(|found| Some((found.track as usize, found.part, found.weight, found.point?))).collect();
+    let comment = "scpsfm points that two views see: consistent with these, not verified; frames as in points.ply and \
+                   points-part-N.ply";
+    (!vertices.is_empty()).then(|| weighted(comment, "part", vertices, input))
+}
+
+/// Points with their weights and tracks, and a number of this name.
+fn weighted(
+    comment: &str,
+    number_name: &str,
+    vertices: Vec<(usize, u32, f32, [f64; 3])>,
+    input: Option<&LabelledInput>,
+) -> String {
     let mut text = format!(
-        "ply\nformat ascii 1.0\ncomment scpsfm points{which}, {frame}, coloured by weight\nelement vertex {}\n\
+        "ply\nformat ascii 1.0\ncomment {comment}\nelement vertex {}\n\
          property double x\nproperty double y\nproperty double z\n\
          property uchar red\nproperty uchar green\nproperty uchar blue\n\
-         property float weight\nproperty double track\nproperty uint split\nend_header\n",
+         property float weight\nproperty double track\nproperty uint {number_name}\nend_header\n",
         vertices.len()
     );
     for (track, number, weight, [x, y, z]) in vertices {
@@ -76,6 +98,7 @@ pub fn colour(weight: f32) -> [u8; 3] {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::domain::result::TwoViewTrack;
     use crate::formats::fixture;
 
     #[test]
@@ -119,6 +142,21 @@ mod tests {
         let of_track = text.lines().filter(|line| line.split(' ').nth(7) == Some(&label));
         let numbers: Vec<&str> = of_track.filter_map(|line| line.rsplit(' ').next()).collect();
         assert_eq!(numbers, ["0", "1"]);
+    }
+
+    #[test]
+    fn what_two_views_see_has_a_file_of_its_own() {
+        let (input, mut solution) = fixture::solved();
+        let before = points(&solution, Some(&input), 0);
+        assert_eq!(two_view_points(&solution, Some(&input)), None);
+        let seen = TwoViewTrack { track: 1, weight: 0.75, part: 2, point: Some([1.5, -2.0, 3.0]) };
+        solution.two_view_tracks = vec![seen, TwoViewTrack { track: 3, point: None, ..seen }];
+        let text = two_view_points(&solution, Some(&input)).expect("a point");
+        assert!(text.contains("element vertex 1\n") && text.contains("property uint part\n"), "{text}");
+        let [red, green, blue] = colour(0.75);
+        let label = &input.track_labels[1];
+        assert!(text.ends_with(&format!("\n1.5 -2 3 {red} {green} {blue} 0.75 {label} 2\n")), "{text}");
+        assert_eq!(points(&solution, Some(&input), 0), before);
     }
 
     #[test]

@@ -1,5 +1,6 @@
 //! The result files of a solve: what each holds.
 
+use std::collections::BTreeSet;
 use std::io;
 use std::path::{Path, PathBuf};
 
@@ -17,6 +18,7 @@ pub const TRACKS: &str = "tracks.csv";
 pub const OBSERVATIONS: &str = "observations.csv";
 pub const CAMERAS: &str = "cameras.json";
 pub const POINTS: &str = "points.ply";
+pub const TWO_VIEW_POINTS: &str = "points-two-view.ply";
 pub const REPORT: &str = "report.html";
 pub const RESULT: &str = "result.json";
 
@@ -53,6 +55,9 @@ pub fn write(
     for part in 0..solution.part_count().max(1) {
         draft.add(points_of(part), ply::points(solution, input, part).as_bytes())?;
     }
+    if let Some(points) = ply::two_view_points(solution, input) {
+        draft.add(TWO_VIEW_POINTS, points.as_bytes())?;
+    }
     draft.add(REPORT, report::page(solution, input).as_bytes())?;
     let refused = match input {
         Some(input) => export::add(&mut draft, exports, solution, input)?,
@@ -65,7 +70,8 @@ pub fn write(
 /// What of an input, a file or the directory of a model, a result in `directory` would replace.
 pub fn replaced(directory: &Path, exports: &[Export], input: &Path) -> Option<PathBuf> {
     let input = input.canonicalize().ok()?;
-    let names = [TRACKS, OBSERVATIONS, CAMERAS, POINTS, REPORT, RESULT, manifest::NAME].map(PathBuf::from);
+    let names =
+        [TRACKS, OBSERVATIONS, CAMERAS, POINTS, TWO_VIEW_POINTS, REPORT, RESULT, manifest::NAME].map(PathBuf::from);
     let folders = exports.iter().flat_map(|export| {
         let folder = PathBuf::from(export.folder());
         let files: Vec<PathBuf> = export.inputs().iter().map(|file| folder.join(file)).collect();
@@ -93,14 +99,17 @@ pub fn said(directory: &Path, solution: &Solution) -> String {
     format!("{}; {POINTS} holds the points of part 0, {others} those of the others", directory.display())
 }
 
-/// `track,weight,inlier`, `network_weight` where a network ran, the `part` that the track has a point in, empty where it
-/// has none, and `second_structure` where one was found; one line a track.
+/// `track,weight,inlier`, `network_weight` where a network ran, the `part` that the track has a point in, empty where
+/// it has none, `second_structure` where one was found, and `two_view` where tracks that two views see are consistent;
+/// one line a track.
 fn tracks_csv(solution: &Solution, input: Option<&LabelledInput>) -> String {
     let tracks = &solution.tracks;
     let (has_network, has_second) = (!tracks.network_weight.is_empty(), !tracks.second_structure.is_empty());
     let mut text = String::from("track,weight,inlier");
     text.push_str(if has_network { ",network_weight,part" } else { ",part" });
-    text.push_str(if has_second { ",second_structure\n" } else { "\n" });
+    text.push_str(if has_second { ",second_structure" } else { "" });
+    let two_view: BTreeSet<usize> = solution.two_view_tracks.iter().map(|found| found.track as usize).collect();
+    text.push_str(if two_view.is_empty() { "\n" } else { ",two_view\n" });
     for (track, (weight, &inlier)) in tracks.weight.iter().zip(&tracks.inlier).enumerate() {
         text.push_str(&format!("{},{weight},{}", track_label(input, track).csv(), u8::from(inlier)));
         if has_network {
@@ -110,6 +119,9 @@ fn tracks_csv(solution: &Solution, input: Option<&LabelledInput>) -> String {
         text.push_str(&format!(",{part}"));
         if has_second {
             text.push_str(&format!(",{}", tracks.second_structure.get(track).copied().unwrap_or(0)));
+        }
+        if !two_view.is_empty() {
+            text.push_str(&format!(",{}", u8::from(two_view.contains(&track))));
         }
         text.push('\n');
     }

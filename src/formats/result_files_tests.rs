@@ -4,7 +4,7 @@ use std::fs;
 use serde_json::Value;
 
 use super::*;
-use crate::domain::result::{ObservationResults, Sigmas};
+use crate::domain::result::{ObservationResults, Sigmas, TwoViewTrack};
 use crate::domain::{Calibration, Grade, LeftOut, LensProjection, Status, Warning, WarningCode};
 use crate::formats::fixture;
 use crate::formats::manifest::Manifest;
@@ -63,6 +63,7 @@ fn the_fields_of_result_json_are_a_contract() {
         "inlier_tracks",
         "inlier_observations",
         "split_points",
+        "two_view_tracks",
         "registered_views",
         "reprojection_rms_px",
         "reprojection_mean_px",
@@ -317,6 +318,24 @@ fn without_a_network_there_is_no_fourth_column_and_without_the_input_no_observat
     assert!(!files.contains_key(OBSERVATIONS));
     assert_eq!(files[TRACKS].lines().next(), Some("track,weight,inlier,part"));
     assert!(files[TRACKS].lines().nth(1).expect("a track").starts_with("0,"));
+}
+
+#[test]
+fn tracks_that_two_views_see_are_marked() {
+    let (input, mut solution) = fixture::solved();
+    let column = |solution: &Solution| -> Option<Vec<String>> {
+        let text = tracks_csv(solution, Some(&input));
+        let place = text.lines().next()?.split(',').position(|name| name == "two_view")?;
+        Some(text.lines().skip(1).filter_map(|line| Some(line.split(',').nth(place)?.to_owned())).collect())
+    };
+    assert_eq!(column(&solution), None);
+    solution.two_view_tracks = vec![TwoViewTrack { track: 2, weight: 0.75, part: 0, point: None }];
+    let marked = column(&solution).expect("a column");
+    assert!(
+        marked.len() == solution.tracks.inlier.len()
+            && marked.iter().enumerate().all(|(track, mark)| { mark == if track == 2 { "1" } else { "0" } }),
+        "{marked:?}"
+    );
 }
 
 #[test]

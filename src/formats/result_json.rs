@@ -49,6 +49,8 @@ pub struct ResultJson {
     pub inlier_observations: usize,
     /// Points beside its own that a track joins: each is one of its own in the exports.
     pub split_points: usize,
+    /// Tracks that two registered views of one part see and that are consistent with these.
+    pub two_view_tracks: usize,
     pub registered_views: usize,
     pub reprojection_rms_px: Option<f64>,
     pub reprojection_mean_px: Option<f64>,
@@ -198,6 +200,7 @@ impl ResultJson {
             inlier_tracks: solution.inlier_track_count(),
             inlier_observations: solution.inlier_observation_count(),
             split_points: solution.splits.len(),
+            two_view_tracks: solution.two_view_tracks.len(),
             registered_views: solution.registered_views().len(),
             reprojection_rms_px: solution.reprojection_rms_px,
             reprojection_mean_px: solution.reprojection_mean_px,

@@ -84,8 +84,9 @@ fn no_released_name_is_gone_and_every_new_one_is_listed() {
         names.add_files(Path::new(&path(out)));
         input
     };
-    // A second motion, whose tracks are marked; nothing but wrong tracks; windows of a walk.
+    // A second motion, whose tracks are marked; tracks of two views; nothing but wrong tracks; windows of a walk.
     let input = solved(&["--outliers", "0.5", "--second-motion", "0.3", "--seed", "1"], &[], "metric");
+    solved(&["--photographed", "--seed", "800196"], &[], "two-views");
     solved(&["--outliers", "1", "--tracks", "60"], &[], "nothing");
     let walk = ["--sequence", "--views", "8", "--tracks", "200"];
     solved(&walk, &["--window", "4"], "windows");
@@ -141,7 +142,8 @@ fn promises(pool: &DescriptorPool) -> BTreeSet<String> {
     let values = pool.all_enums().filter(|of| is_ours(of.full_name())).flat_map(value);
     let methods = pool.services().flat_map(|service| service.methods().collect::<Vec<_>>()).map(|method| {
         let streams = (method.is_client_streaming(), method.is_server_streaming());
-        format!("{}: {:?} -> {:?}, {streams:?}", method.full_name(), method.input(), method.output())
+        let (input, output) = (method.input(), method.output());
+        format!("{}: {} -> {}, {streams:?}", method.full_name(), input.full_name(), output.full_name())
     });
     fields.chain(values).chain(methods).collect()
 }

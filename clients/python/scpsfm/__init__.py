@@ -66,6 +66,7 @@ from .result import (
     ResultWarning,
     Split,
     TrackResults,
+    TwoViewTracks,
 )
 from .tracks import FocalPrior, Tracks, View
 
@@ -122,6 +123,7 @@ __all__ = [
     "StoreFull",
     "TrackResults",
     "Tracks",
+    "TwoViewTracks",
     "Unauthenticated",
     "Unavailable",
     "Unimplemented",

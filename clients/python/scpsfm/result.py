@@ -338,6 +338,23 @@ class Split:
     """(3,); `None`: at infinity."""
 
 
+@dataclass(frozen=True, eq=False)
+class TwoViewTracks:
+    """The tracks that two registered views of one part see: consistent with these, not verified."""
+
+    track: NDArray[np.int64]
+    """Index of each, in rising order. (tracks,)."""
+
+    weight: NDArray[np.float32]
+    """Probability that the track is right by its residuals and by the share of right ones among others. (tracks,)."""
+
+    part: NDArray[np.int64]
+    """The part whose views see it. (tracks,)."""
+
+    points: Floats
+    """X, Y, Z in the frame of that part; NaN at infinity. (tracks, 3)."""
+
+
 class Result:
     """Everything that a solve found. Properties are computed once; arrays cannot be written to."""
 
@@ -606,6 +623,19 @@ class Result:
                 _row(found.point, np.float64, 3, "coordinates of a point") if found.point else None,
             )
             for found in self.message.track_splits
+        )
+
+    @cached_property
+    def two_view_tracks(self) -> TwoViewTracks:
+        """The tracks that two registered views of one part see and that are consistent with these."""
+        found = self.message.two_view_tracks
+        points = [track.point if track.point else (np.nan,) * 3 for track in found]
+        row = _row([x for point in points for x in point], np.float64, 3 * len(found), "coordinates of points")
+        return TwoViewTracks(
+            track=_row([track.track_index for track in found], np.int64),
+            weight=_row([track.weight for track in found], np.float32),
+            part=_row([track.part for track in found], np.int64),
+            points=row.reshape(len(found), 3),
         )
 
     def to_colmap_database(self, path: str | PathLike[str]) -> None:

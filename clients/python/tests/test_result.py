@@ -186,6 +186,20 @@ def test_splits_and_parts_are_told(small: scene.Scene) -> None:
     assert result.point_parts[-1] == 1
 
 
+def test_tracks_of_two_views_are_told(small: scene.Scene) -> None:
+    message = scene.true_result(small)
+    assert len(Result(message).two_view_tracks.track) == 0
+    message.two_view_tracks.add(track_index=3, weight=0.75, point=[1.0, 2.0, 3.0])
+    message.two_view_tracks.add(track_index=5, weight=0.5, part=1)
+    found = Result(message).two_view_tracks
+    assert (found.track.tolist(), found.weight.tolist(), found.part.tolist()) == ([3, 5], [0.75, 0.5], [0, 1])
+    assert found.points[0].tolist() == [1, 2, 3]
+    assert np.isnan(found.points[1]).all()
+    message.two_view_tracks[0].point.pop()
+    with pytest.raises(scpsfm.InternalError, match="coordinates of points"):
+        _ = Result(message).two_view_tracks
+
+
 def test_a_result_is_saved_and_loaded(small: scene.Scene, tmp_path: Path) -> None:
     result = Result(scene.true_result(small), small.tracks)
     result.save(tmp_path / "r.pb")

@@ -143,6 +143,7 @@ fn solution(input: &Input, call: u64) -> Solution {
         tracks: Default::default(),
         observations: Default::default(),
         splits: Vec::new(),
+        two_view_tracks: Vec::new(),
         noise_px: None,
         reprojection_rms_px: Some(0.5),
         reprojection_mean_px: None,

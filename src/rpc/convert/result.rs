@@ -7,7 +7,7 @@ use super::time::{duration_to_wire, seconds_from_wire};
 use super::{progress, required};
 use crate::domain::job::JobName;
 use crate::domain::result::{
-    ObservationResults, ProposalTime, Sigmas, StageTime, TrackResults, TrackSplit, ViewResult,
+    ObservationResults, ProposalTime, Sigmas, StageTime, TrackResults, TrackSplit, TwoViewTrack, ViewResult,
 };
 use crate::domain::{
     Calibration, Grade, JoinedTracks, Joining, LeftOut, LensProjection, Method, Proposal, Sha256Digest, Solution,
@@ -36,6 +36,7 @@ fn to_wire(name: &JobName, solution: &Solution) -> proto::JobResult {
         tracks: Some(tracks_to_wire(&solution.tracks)),
         observations: Some(observations_to_wire(&solution.observations)),
         track_splits: solution.splits.iter().map(split_to_wire).collect(),
+        two_view_tracks: solution.two_view_tracks.iter().map(two_view_track_to_wire).collect(),
         noise_px: solution.noise_px,
         reprojection_rms_px: solution.reprojection_rms_px,
         reprojection_mean_px: solution.reprojection_mean_px,
@@ -68,6 +69,7 @@ fn to_wire(name: &JobName, solution: &Solution) -> proto::JobResult {
 /// # Errors
 /// A violation that names the field which no server of this version would send.
 pub fn from_wire(result: proto::JobResult) -> Result<Solution, Violation> {
+    let tracks = tracks_from_wire(required(result.tracks, "tracks")?)?;
     Ok(Solution {
         status: Status::required(result.status, "status")?,
         grade: Grade::from_wire(result.grade, "grade")?,
@@ -78,9 +80,10 @@ pub fn from_wire(result: proto::JobResult) -> Result<Solution, Violation> {
         calibrations: result.calibrations.iter().map(calibration_from_wire).collect::<Result<_, _>>()?,
         plane_at_infinity: result.plane_at_infinity.map(|plane| [plane.x, plane.y, plane.z]),
         views: result.views.iter().enumerate().map(view_from_wire).collect::<Result<_, _>>()?,
-        tracks: tracks_from_wire(required(result.tracks, "tracks")?)?,
         observations: observations_from_wire(required(result.observations, "observations")?)?,
         splits: result.track_splits.iter().enumerate().map(split_from_wire).collect::<Result<_, _>>()?,
+        two_view_tracks: two_view_tracks_from_wire(&result.two_view_tracks, tracks.weight.len())?,
+        tracks,
         noise_px: result.noise_px,
         reprojection_rms_px: result.reprojection_rms_px,
         reprojection_mean_px: result.reprojection_mean_px,
@@ -289,6 +292,22 @@ fn tracks_to_wire(tracks: &TrackResults) -> proto::TrackResults {
     }
 }
 
+/// Checks the tracks that two views see against the number of all tracks.
+fn two_view_tracks_from_wire(found: &[proto::TwoViewTrack], count: usize) -> Result<Vec<TwoViewTrack>, Violation> {
+    let mut next = 0;
+    let track = |(index, found): (usize, &proto::TwoViewTrack)| {
+        let proto::TwoViewTrack { track_index: track, weight, part, ref point } = *found;
+        if !(next..count).contains(&(track as usize)) {
+            let what = format!("track {track} is not in rising order within the {count} tracks");
+            return Err(Violation::at("two_view_tracks.track_index", index, what));
+        }
+        next = track as usize + 1;
+        let point = point_from_wire(point, "two_view_tracks.point", index)?;
+        Ok(TwoViewTrack { track, weight, part, point })
+    };
+    found.iter().enumerate().map(track).collect()
+}
+
 fn tracks_from_wire(tracks: proto::TrackResults) -> Result<TrackResults, Violation> {
     let count = tracks.weights.len();
     let is_of_all = |length: usize| length == 0 || length == count;
@@ -349,18 +368,22 @@ fn split_to_wire(split: &TrackSplit) -> proto::TrackSplit {
 }
 
 fn split_from_wire((index, split): (usize, &proto::TrackSplit)) -> Result<TrackSplit, Violation> {
-    let point = match split.point.as_slice() {
-        [] => None,
-        &[x, y, z] => Some([x, y, z]),
-        other => {
-            return Err(Violation::at(
-                "track_splits.point",
-                index,
-                format!("{} numbers instead of three", other.len()),
-            ));
-        }
-    };
+    let point = point_from_wire(&split.point, "track_splits.point", index)?;
     Ok(TrackSplit { track: split.track_index, number: split.number, weight: split.weight, point })
+}
+
+fn two_view_track_to_wire(found: &TwoViewTrack) -> proto::TwoViewTrack {
+    let TwoViewTrack { track, weight, part, point } = *found;
+    proto::TwoViewTrack { track_index: track, weight, part, point: point.map_or_else(Vec::new, Vec::from) }
+}
+
+/// A point, or none at infinity.
+fn point_from_wire(numbers: &[f64], field: &'static str, index: usize) -> Result<Option<[f64; 3]>, Violation> {
+    match *numbers {
+        [] => Ok(None),
+        [x, y, z] => Ok(Some([x, y, z])),
+        _ => Err(Violation::at(field, index, format!("{} numbers instead of three", numbers.len()))),
+    }
 }
 
 fn observations_from_wire(mut observations: proto::ObservationResults) -> Result<ObservationResults, Violation> {

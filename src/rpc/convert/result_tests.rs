@@ -109,6 +109,10 @@ pub(super) fn rich() -> Solution {
             TrackSplit { track: 1, number: 1, weight: 0.75, point: None },
             TrackSplit { track: 1, number: 2, weight: 0.5, point: Some([1.0, -2.0, 3e-9]) },
         ],
+        two_view_tracks: vec![
+            TwoViewTrack { track: 0, weight: 0.75, part: 1, point: Some([4.0, 5.0, 6.0]) },
+            TwoViewTrack { track: 2, weight: 0.875, part: 0, point: None },
+        ],
         noise_px: Some(0.5),
         reprojection_rms_px: Some(0.7),
         reprojection_mean_px: Some(0.6),
@@ -154,6 +158,7 @@ fn a_solution_without_a_reconstruction_survives_too() {
         views: vec![ViewResult::default(); 2],
         tracks: TrackResults::default(),
         observations: ObservationResults::default(),
+        two_view_tracks: Vec::new(),
         trained_network_sha256: None,
         noise_px: None,
         reprojection_rms_px: None,
@@ -186,6 +191,10 @@ fn a_malformed_answer_names_its_field() {
     );
     assert_eq!(with(&|result| tracks(result, &|tracks| tracks.points.truncate(2))), "tracks.points");
     assert_eq!(with(&|result| tracks(result, &|tracks| tracks.point_parts.push(1))), "tracks.point_parts");
+    let two_view_track = "two_view_tracks.track_index[1]";
+    assert_eq!(with(&|result| result.two_view_tracks[1].track_index = 3), two_view_track);
+    assert_eq!(with(&|result| result.two_view_tracks[1].track_index = 0), two_view_track);
+    assert_eq!(with(&|result| result.two_view_tracks[0].point.truncate(2)), "two_view_tracks.point[0]");
     assert_eq!(with(&|result| result.calibrations[0].grade = 9), "calibrations.grade");
     assert_eq!(with(&|result| result.calibrations[0].lens_projection = 9), "calibrations.lens_projection");
 }

@@ -102,6 +102,7 @@ pub fn solution(input: &Input, settings: &SolveSettings) -> Solution {
             ..ObservationResults::unjudged(input.observation_count())
         },
         splits: Vec::new(),
+        two_view_tracks: Vec::new(),
         noise_px: Some(0.5),
         reprojection_rms_px: Some(0.75),
         reprojection_mean_px: None,

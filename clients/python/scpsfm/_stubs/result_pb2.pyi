@@ -252,6 +252,18 @@ class TrackSplit(_message.Message):
     point: _containers.RepeatedScalarFieldContainer[float]
     def __init__(self, track_index: _Optional[int] = ..., number: _Optional[int] = ..., weight: _Optional[float] = ..., point: _Optional[_Iterable[float]] = ...) -> None: ...
 
+class TwoViewTrack(_message.Message):
+    __slots__ = ("track_index", "weight", "part", "point")
+    TRACK_INDEX_FIELD_NUMBER: _ClassVar[int]
+    WEIGHT_FIELD_NUMBER: _ClassVar[int]
+    PART_FIELD_NUMBER: _ClassVar[int]
+    POINT_FIELD_NUMBER: _ClassVar[int]
+    track_index: int
+    weight: float
+    part: int
+    point: _containers.RepeatedScalarFieldContainer[float]
+    def __init__(self, track_index: _Optional[int] = ..., weight: _Optional[float] = ..., part: _Optional[int] = ..., point: _Optional[_Iterable[float]] = ...) -> None: ...
+
 class JoinedTracks(_message.Message):
     __slots__ = ("view_indices", "track_indices", "keypoint_indices", "match_count", "cut_match_count")
     VIEW_INDICES_FIELD_NUMBER: _ClassVar[int]
@@ -285,7 +297,7 @@ class ProposalDuration(_message.Message):
     def __init__(self, proposal: _Optional[_Union[Proposal, str]] = ..., duration: _Optional[_Union[_duration_pb2.Duration, _Mapping]] = ..., step_count: _Optional[int] = ...) -> None: ...
 
 class JobResult(_message.Message):
-    __slots__ = ("job", "server_version", "status", "grade", "method", "winning_proposal", "iteration_count", "seed", "calibrations", "plane_at_infinity", "views", "tracks", "observations", "track_splits", "noise_px", "reprojection_rms_px", "reprojection_mean_px", "warnings", "solve_duration", "stage_durations", "proposal_durations", "progress_records", "trained_network_sha256", "input_content_sha256", "joined_tracks")
+    __slots__ = ("job", "server_version", "status", "grade", "method", "winning_proposal", "iteration_count", "seed", "calibrations", "plane_at_infinity", "views", "tracks", "observations", "track_splits", "noise_px", "reprojection_rms_px", "reprojection_mean_px", "warnings", "solve_duration", "stage_durations", "proposal_durations", "progress_records", "trained_network_sha256", "input_content_sha256", "joined_tracks", "two_view_tracks")
     JOB_FIELD_NUMBER: _ClassVar[int]
     SERVER_VERSION_FIELD_NUMBER: _ClassVar[int]
     STATUS_FIELD_NUMBER: _ClassVar[int]
@@ -311,6 +323,7 @@ class JobResult(_message.Message):
     TRAINED_NETWORK_SHA256_FIELD_NUMBER: _ClassVar[int]
     INPUT_CONTENT_SHA256_FIELD_NUMBER: _ClassVar[int]
     JOINED_TRACKS_FIELD_NUMBER: _ClassVar[int]
+    TWO_VIEW_TRACKS_FIELD_NUMBER: _ClassVar[int]
     job: str
     server_version: str
     status: ResultStatus
@@ -336,4 +349,5 @@ class JobResult(_message.Message):
     trained_network_sha256: bytes
     input_content_sha256: bytes
     joined_tracks: JoinedTracks
-    def __init__(self, job: _Optional[str] = ..., server_version: _Optional[str] = ..., status: _Optional[_Union[ResultStatus, str]] = ..., grade: _Optional[_Union[Grade, str]] = ..., method: _Optional[_Union[_settings_pb2.Method, str]] = ..., winning_proposal: _Optional[_Union[Proposal, str]] = ..., iteration_count: _Optional[int] = ..., seed: _Optional[int] = ..., calibrations: _Optional[_Iterable[_Union[Calibration, _Mapping]]] = ..., plane_at_infinity: _Optional[_Union[PlaneAtInfinity, _Mapping]] = ..., views: _Optional[_Iterable[_Union[ViewResult, _Mapping]]] = ..., tracks: _Optional[_Union[TrackResults, _Mapping]] = ..., observations: _Optional[_Union[ObservationResults, _Mapping]] = ..., track_splits: _Optional[_Iterable[_Union[TrackSplit, _Mapping]]] = ..., noise_px: _Optional[float] = ..., reprojection_rms_px: _Optional[float] = ..., reprojection_mean_px: _Optional[float] = ..., warnings: _Optional[_Iterable[_Union[Warning, _Mapping]]] = ..., solve_duration: _Optional[_Union[_duration_pb2.Duration, _Mapping]] = ..., stage_durations: _Optional[_Iterable[_Union[StageDuration, _Mapping]]] = ..., proposal_durations: _Optional[_Iterable[_Union[ProposalDuration, _Mapping]]] = ..., progress_records: _Optional[_Iterable[_Union[_progress_pb2.Progress, _Mapping]]] = ..., trained_network_sha256: _Optional[bytes] = ..., input_content_sha256: _Optional[bytes] = ..., joined_tracks: _Optional[_Union[JoinedTracks, _Mapping]] = ...) -> None: ...
+    two_view_tracks: _containers.RepeatedCompositeFieldContainer[TwoViewTrack]
+    def __init__(self, job: _Optional[str] = ..., server_version: _Optional[str] = ..., status: _Optional[_Union[ResultStatus, str]] = ..., grade: _Optional[_Union[Grade, str]] = ..., method: _Optional[_Union[_settings_pb2.Method, str]] = ..., winning_proposal: _Optional[_Union[Proposal, str]] = ..., iteration_count: _Optional[int] = ..., seed: _Optional[int] = ..., calibrations: _Optional[_Iterable[_Union[Calibration, _Mapping]]] = ..., plane_at_infinity: _Optional[_Union[PlaneAtInfinity, _Mapping]] = ..., views: _Optional[_Iterable[_Union[ViewResult, _Mapping]]] = ..., tracks: _Optional[_Union[TrackResults, _Mapping]] = ..., observations: _Optional[_Union[ObservationResults, _Mapping]] = ..., track_splits: _Optional[_Iterable[_Union[TrackSplit, _Mapping]]] = ..., noise_px: _Optional[float] = ..., reprojection_rms_px: _Optional[float] = ..., reprojection_mean_px: _Optional[float] = ..., warnings: _Optional[_Iterable[_Union[Warning, _Mapping]]] = ..., solve_duration: _Optional[_Union[_duration_pb2.Duration, _Mapping]] = ..., stage_durations: _Optional[_Iterable[_Union[StageDuration, _Mapping]]] = ..., proposal_durations: _Optional[_Iterable[_Union[ProposalDuration, _Mapping]]] = ..., progress_records: _Optional[_Iterable[_Union[_progress_pb2.Progress, _Mapping]]] = ..., trained_network_sha256: _Optional[bytes] = ..., input_content_sha256: _Optional[bytes] = ..., joined_tracks: _Optional[_Union[JoinedTracks, _Mapping]] = ..., two_view_tracks: _Optional[_Iterable[_Union[TwoViewTrack, _Mapping]]] = ...) -> None: ...

@@ -102,21 +102,22 @@ impl Duplicates {
         for (duplicate, first) in self.list() {
             of_first.entry(first as u32).or_default().push(duplicate);
         }
-        let split_duplicates: Vec<_> = solution
-            .splits
-            .iter()
-            .flat_map(|split| {
-                let duplicates = of_first.get(&split.track).into_iter().flatten();
-                duplicates.map(move |&duplicate| {
-                    let mut split = *split;
-                    split.track = duplicate as u32;
-                    split
-                })
-            })
-            .collect();
-        solution.splits.extend(split_duplicates);
-        solution.splits.sort_by_key(|split| (split.track, split.number));
+        repeat(&mut solution.splits, &of_first, |split| &mut split.track);
+        repeat(&mut solution.two_view_tracks, &of_first, |found| &mut found.track);
     }
+}
+
+/// Repeats what is said of tracks for their duplicates, and sorts it by track.
+fn repeat<T: Copy>(said: &mut Vec<T>, of_first: &HashMap<u32, Vec<usize>>, track: impl Fn(&mut T) -> &mut u32) {
+    for k in 0..said.len() {
+        let mut entry = said[k];
+        for &duplicate in of_first.get(track(&mut entry)).into_iter().flatten() {
+            let mut repeated = entry;
+            *track(&mut repeated) = duplicate as u32;
+            said.push(repeated);
+        }
+    }
+    said.sort_by_key(|entry| *track(&mut entry.clone()));
 }
 
 /// The observations of each track, by view.

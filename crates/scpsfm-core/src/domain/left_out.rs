@@ -12,6 +12,12 @@ const MOST_LISTED: usize = 20;
 /// The same for views that nothing is observed in: their number says what went wrong, a few names where to look.
 const MOST_LISTED_EMPTY: usize = 5;
 
+/// Views that see many points of which few agree, from which on another camera is named: one or two may hold wrong
+/// matches.
+const LEAST_CONTRADICTED_VIEWS: usize = 3;
+/// Points that are many: three times as many as determine a pose beyond chance. Few is less than a third of them.
+const MANY_POINTS: u32 = 24;
+
 /// Why a view is not registered.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "SCREAMING_SNAKE_CASE")]
@@ -27,6 +33,12 @@ pub enum LeftOut {
 }
 
 impl LeftOut {
+    /// Whether the view sees many points of which few agree.
+    fn is_contradicted(self) -> bool {
+        let LeftOut::NotRegistered { points, agreeing } = self else { return false };
+        points >= MANY_POINTS && agreeing < points / 3
+    }
+
     /// The reason as it stands in files.
     pub fn name(self) -> &'static str {
         match self {
@@ -72,6 +84,11 @@ pub fn warnings(views: &[ViewResult], name: impl Fn(usize) -> String) -> Vec<War
             unregistered.len(),
             listed(named, MOST_LISTED)
         ));
+        let is_contradicted = |(_, reason): &&(usize, LeftOut)| reason.is_contradicted();
+        if unregistered.iter().filter(is_contradicted).count() >= LEAST_CONTRADICTED_VIEWS {
+            let last = details.len() - 1;
+            details[last].push_str("; views that see many points of which few agree may be of another camera or zoom");
+        }
     }
     if !outside.is_empty() {
         details.push(format!(
@@ -126,6 +143,16 @@ mod tests {
                 "nothing is observed in 6 of 9 views: 2.jpg, 4.jpg, 5.jpg, 6.jpg, 7.jpg, and 1 more",
             ]
         );
+    }
+
+    #[test]
+    fn views_that_many_points_contradict_may_be_of_another_camera() {
+        let views = |count: usize, points: u32| {
+            let reason = LeftOut::NotRegistered { points, agreeing: 10 };
+            warnings(&views(&vec![Some(reason); count]), |view| view.to_string())[0].detail.clone()
+        };
+        assert!(views(3, 70).ends_with("may be of another camera or zoom"), "{}", views(3, 70));
+        assert!(!views(2, 70).contains("another camera") && !views(3, 28).contains("another camera"));
     }
 
     #[test]

@@ -248,8 +248,8 @@ pub struct TrackResults {
     pub point: Vec<Option<[f64; 3]>>,
     /// Reconstruction in whose frame each track's point is, see [`ViewResult::part`]; empty: all are in that of part 0.
     pub part: Vec<u32>,
-    /// Which of the rigid motions that `SECOND_STRUCTURE` reports each track, rejected, agrees with: from 1, 0 for none;
-    /// empty where none is reported.
+    /// Which of the rigid motions that `SECOND_STRUCTURE` reports each track, rejected, agrees with: from 1, 0 for
+    /// none; empty where none is reported.
     pub second_structure: Vec<u32>,
 }
 
@@ -307,6 +307,21 @@ pub struct TrackSplit {
     pub point: Option<[f64; 3]>,
 }
 
+/// A track that two registered views of one part see, and whose observations agree on a point, in front of both cameras
+/// where these are metric: consistent, not verified. It is no inlier.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+pub struct TwoViewTrack {
+    /// Index of the track.
+    pub track: u32,
+    /// Probability that it is right by its residuals and by the share of right tracks among those that more views see:
+    /// more than one half.
+    pub weight: f32,
+    /// Reconstruction whose views see it, see [`ViewResult::part`].
+    pub part: u32,
+    /// In the frame of [`TrackResults::point`]; `None`: at infinity.
+    pub point: Option<[f64; 3]>,
+}
+
 /// Seconds spent in a stage.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 pub struct StageTime {
@@ -347,6 +362,8 @@ pub struct Solution {
     pub observations: ObservationResults,
     /// The other points of tracks that join several, by track and number.
     pub splits: Vec<TrackSplit>,
+    /// Tracks that two registered views of one part see and that are consistent with these, by track.
+    pub two_view_tracks: Vec<TwoViewTrack>,
     /// Estimated observation noise, one standard deviation of a coordinate, in pixels.
     pub noise_px: Option<f64>,
     /// Root mean square and mean of the reprojection errors (distances) over the inlier observations, in pixels.

@@ -16,7 +16,7 @@ use super::second_structures::{self, SecondStructure};
 use super::sequence::Ended;
 use super::view_selection::{LEAST_SHARED_BY_PAIR, LEAST_VIEWS};
 use super::{Error, static_tracks};
-use crate::domain::result::{ObservationResults, Sigmas, TrackResults, TrackSplit, ViewResult};
+use crate::domain::result::{ObservationResults, Sigmas, TrackResults, TrackSplit, TwoViewTrack, ViewResult};
 use crate::domain::{Calibration, Grade, Solution, Stage, Status, Warning, WarningCode};
 use crate::geometry::bundle::metric::{Intrinsics, Parameter};
 use crate::geometry::daq::oriented;
@@ -80,12 +80,19 @@ impl Assembled {
             Ended::Block(Some(attempt)) => (Reconstruction::of_attempt(problem, &attempt), Some(attempt)),
             Ended::Block(None) => (None, None),
         };
-        let (reconstruction, mut seed) = match (reconstruction, seed) {
+        let (mut reconstruction, mut seed) = match (reconstruction, seed) {
             (Some(reconstruction), Some(seed)) => (reconstruction, seed),
             (_, seed) => return Err(Unsolved { seed }),
         };
         recorder.enter(Stage::Classify);
-        let judged = seed.judged.take().unwrap_or_else(|| reconstruction.judged(problem, &seed, recorder));
+        let mut judged = seed.judged.take().unwrap_or_else(|| reconstruction.judged(problem, &seed, recorder));
+        if reconstruction.grade == Grade::Metric && seed.decided.is_none() {
+            let contradicted = judged.contradicted_views(problem);
+            if !contradicted.is_empty() {
+                reconstruction.leave_out(contradicted);
+                judged = reconstruction.judged(problem, &seed, recorder);
+            }
+        }
         Ok(Self { reconstruction, seed: *seed, judged, evidence })
     }
 
@@ -148,6 +155,17 @@ impl Reconstruction {
             point: place(&split.point, split.track, &split.retained),
         };
         let splits = judged.splits.iter().map(split).collect();
+        let two_view_points = classification::two_view_points(problem, &self.geometry, judged.noise);
+        let two_view_track = |found: &classification::TwoViewPoint| TwoViewTrack {
+            track: found.track as u32,
+            weight: found.weight as f32,
+            part: self.geometry.component_of_track[found.track],
+            point: place(&found.point, found.track, &found.retained),
+        };
+        // What depths or a method of its own make an inlier needs no other verdict.
+        let is_told =
+            |found: &&classification::TwoViewPoint| !judged.tracks.inlier[found.track] && self.holds(&found.retained);
+        let two_view_tracks = two_view_points.iter().filter(is_told).map(two_view_track).collect();
         if self.geometry.component_of_view.iter().any(|&component| component > 0) {
             let of_point = |(point, component): (&Option<_>, &u32)| point.map_or(0, |_: [f64; 3]| *component);
             judged.tracks.part = points.iter().zip(&self.geometry.component_of_track).map(of_point).collect();
@@ -166,6 +184,7 @@ impl Reconstruction {
             tracks: judged.tracks,
             observations: judged.observations,
             splits,
+            two_view_tracks,
             noise_px: Some(self.geometry.noise * problem.scale_px),
             reprojection_rms_px: rms,
             reprojection_mean_px: mean,
@@ -308,6 +327,7 @@ fn nothing(problem: &Problem, attempt: Option<&Attempt>, warnings: Vec<Warning>,
         },
         observations: ObservationResults::unjudged(problem.input.observation_count()),
         splits: Vec::new(),
+        two_view_tracks: Vec::new(),
         noise_px: None,
         reprojection_rms_px: None,
         reprojection_mean_px: None,

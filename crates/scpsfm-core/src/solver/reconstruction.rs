@@ -121,6 +121,15 @@ impl Reconstruction {
         }
     }
 
+    /// The same without these views, for these reasons.
+    pub fn leave_out(&mut self, views: Vec<(usize, LeftOut)>) {
+        for &(view, _) in &views {
+            self.geometry.cameras[view] = None;
+            self.poses[view] = None;
+        }
+        self.left_out.extend(views);
+    }
+
     /// Every track and observation judged by all registered views, or by what else the method goes by.
     pub fn judged(&self, problem: &Problem, seed: &Attempt, recorder: &mut Recorder) -> Judged {
         let mut progress = |verdicts| recorder.judged(verdicts, problem.tracks());

@@ -11,8 +11,10 @@ mod track_classifier;
 pub use noise::{NoiseModel, outlier_density, working_gate};
 pub use options::ClassificationOptions;
 
-use crate::domain::Input;
+use std::ops::Range;
+
 use crate::domain::result::{ObservationResults, TrackResults};
+use crate::domain::{Input, LeftOut};
 use crate::geometry::bundle::metric::Intrinsics;
 use crate::geometry::observation::Observation;
 use crate::geometry::robust_triangulation::{self, Triangulator};
@@ -20,7 +22,7 @@ use crate::geometry::triangulation::batch::LANES;
 use crate::geometry::{Camera, Point};
 use crate::solver::per_track::{BATCH, TRACKS_A_RUN, WORTH_A_THREAD};
 use crate::solver::problem::{LEAST_RETAINED_SHARE, Problem};
-use track_classifier::TrackClassifier;
+use track_classifier::{Finding, TrackClassifier};
 
 const OPTIONS: ClassificationOptions = ClassificationOptions::DEFAULT;
 
@@ -55,6 +57,17 @@ impl Geometry {
             self.cameras[view].is_some() && self.component_of_view[view] == self.component_of_track[track]
         };
         problem.of_track(track).filter(|&k| is_seen(problem.view_of(k))).collect()
+    }
+
+    /// Those of some tracks that are of the scene, each with its observations in registered views of its component.
+    fn judgeable(&self, problem: &Problem, tracks: Range<usize>) -> impl Iterator<Item = (usize, Vec<usize>)> {
+        let is_of_scene = |&track: &usize| self.of_static || !problem.is_static[track];
+        tracks.filter(is_of_scene).map(|track| (track, self.of_track(problem, track)))
+    }
+
+    /// These observations where pinholes would see them.
+    fn observations(&self, problem: &Problem, seen: &[usize]) -> Vec<Observation> {
+        seen.iter().map(|&k| self.observation(problem, k)).collect()
     }
 
     /// Observation `k` where a pinhole would see it; what a lens images nowhere stays where it is, far from any point.
@@ -99,6 +112,17 @@ pub struct SplitPoint {
     pub retained: Vec<Observation>,
 }
 
+/// The point of a track that two registered views see and whose observations agree with their cameras: it may be right,
+/// and nothing verifies it.
+pub struct TwoViewPoint {
+    pub track: usize,
+    /// Probability that it is right.
+    pub weight: f64,
+    pub point: Point,
+    /// Its two observations.
+    pub retained: Vec<Observation>,
+}
+
 /// Judges every track that has three observations in registered views or more; the others, and static ones that the
 /// geometry is not of, have weight 0 and no residuals.
 ///
@@ -132,26 +156,79 @@ fn whole_tracks(problem: &Problem, geometry: &Geometry, judged: &Judged) -> Vec<
 }
 
 fn judge_under(problem: &Problem, geometry: &Geometry, noise: NoiseModel, progress: &mut dyn FnMut(usize)) -> Judged {
+    let mut judged = Judged::nothing(problem.input, noise);
+    let mut write = |classifier: &TrackClassifier, finding: Finding| classifier.write(&mut judged, &finding);
+    of_each_track(problem, geometry, noise, |classifier, tracks| classifier.find(tracks), &mut write, progress);
+    judged
+}
+
+/// The points of the tracks that two registered views of one component see and that are more likely right than wrong,
+/// in front of both where these are metric.
+///
+/// Two observations fit a point in three of their four coordinates, so that a wrong track is consistent where it is
+/// within the noise of the epipolar line by chance: this verifies nothing.
+pub fn two_view_points(problem: &Problem, geometry: &Geometry, noise: NoiseModel) -> Vec<TwoViewPoint> {
+    let mut points = Vec::new();
+    let mut take = |_: &TrackClassifier, point| points.push(point);
+    of_each_track(
+        problem,
+        geometry,
+        noise,
+        |classifier, tracks| classifier.find_two_view_points(tracks),
+        &mut take,
+        &mut |_| (),
+    );
+    points
+}
+
+/// Calls `find` with the tracks batch by batch, and `take` with each of its findings, in the order of the tracks.
+fn of_each_track<T: Send>(
+    problem: &Problem,
+    geometry: &Geometry,
+    noise: NoiseModel,
+    find: impl Fn(&TrackClassifier, Range<usize>) -> Vec<T> + Sync,
+    take: &mut dyn FnMut(&TrackClassifier, T),
+    progress: &mut dyn FnMut(usize),
+) {
     let cameras = robust_triangulation::or_zeros(&geometry.cameras);
     let triangulator = Triangulator::new(&cameras);
     let least_share = geometry.least_share(problem);
     let classifier = TrackClassifier { problem, cameras: &cameras, triangulator, geometry, least_share, noise };
-    let mut judged = Judged::nothing(problem.input, noise);
     let threads = problem.threads.if_worth(problem.tracks() >= WORTH_A_THREAD);
     for first in (0..problem.tracks()).step_by(BATCH) {
         let last = problem.tracks().min(first + BATCH);
         let side_by_side = |k: usize| match problem.stop.is_stopped() {
             true => Vec::new(),
-            false => classifier.find(first + k * LANES..last.min(first + (k + 1) * LANES)),
+            false => find(&classifier, first + k * LANES..last.min(first + (k + 1) * LANES)),
         };
         let mut progress = |batches| progress(first + batches * LANES);
         let found = threads.map((last - first).div_ceil(LANES), TRACKS_A_RUN / LANES, side_by_side, &mut progress);
-        found.iter().flatten().for_each(|finding| classifier.write(&mut judged, finding));
+        found.into_iter().flatten().for_each(|found| take(&classifier, found));
     }
-    judged
 }
 
 impl Judged {
+    /// The views that keep too few of the observations of right tracks, each with how many of them it has and keeps: the
+    /// pose of a view behind another lens than its own agrees with a few of its points. None where most views do so: then
+    /// they are more likely right than what judged them.
+    pub fn contradicted_views(&self, problem: &Problem) -> Vec<(usize, LeftOut)> {
+        let of_view = |view: usize| {
+            let seen = problem.of_view[view].iter().map(|&k| k as usize);
+            let right = seen.filter(|&k| self.tracks.inlier[problem.track_of(k)]);
+            let right = right.map(|k| problem.input.caller_index(k));
+            let judged: Vec<usize> = right.filter(|&k| self.observations.residual_px[k].is_some()).collect();
+            (judged.len(), judged.iter().filter(|&&k| self.observations.inlier[k]).count())
+        };
+        let few = |view: usize| {
+            let (points, agreeing) = of_view(view);
+            let is_few = (agreeing as f64) < OPTIONS.least_kept_share * points as f64;
+            is_few.then_some((view, LeftOut::NotRegistered { points: points as u32, agreeing: agreeing as u32 }))
+        };
+        let registered = (0..problem.views()).filter(|&view| of_view(view).0 > 0).count();
+        let found: Vec<(usize, LeftOut)> = (0..problem.views()).filter_map(few).collect();
+        if 2 * found.len() > registered { Vec::new() } else { found }
+    }
+
     /// Nothing judged yet.
     fn nothing(input: &Input, noise: NoiseModel) -> Self {
         let count = input.track_count();

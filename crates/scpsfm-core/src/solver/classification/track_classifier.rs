@@ -2,7 +2,7 @@
 
 use std::ops::Range;
 
-use super::{Geometry, Judged, NoiseModel, OPTIONS, SplitPoint};
+use super::{Geometry, Judged, NoiseModel, OPTIONS, SplitPoint, TwoViewPoint};
 use crate::geometry::observation::Observation;
 use crate::geometry::robust_triangulation::{Triangulator, squared_in_front};
 use crate::geometry::triangulation::batch::{Batch, LANES};
@@ -52,14 +52,10 @@ impl TrackClassifier<'_> {
     /// observations, what they leave; without those that too few views see.
     pub fn find(&self, tracks: Range<usize>) -> Vec<Finding> {
         let Self { problem, geometry, .. } = self;
-        let observation = |&k: &usize| geometry.observation(problem, k);
-        let (tracks, seen): (Vec<usize>, Vec<Vec<usize>>) = tracks
-            .filter(|&track| geometry.of_static || !problem.is_static[track])
-            .map(|track| (track, geometry.of_track(problem, track)))
-            .filter(|(_, seen)| seen.len() >= VERIFIED)
-            .unzip();
+        let (tracks, seen): (Vec<usize>, Vec<Vec<usize>>) =
+            geometry.judgeable(problem, tracks).filter(|(_, seen)| seen.len() >= VERIFIED).unzip();
         let observations: Vec<Vec<Observation>> =
-            seen.iter().map(|seen| seen.iter().map(observation).collect()).collect();
+            seen.iter().map(|seen| geometry.observations(problem, seen)).collect();
         let verdicts = self.judge(&observations.iter().map(Vec::as_slice).collect::<Vec<_>>());
         let found = tracks.into_iter().zip(seen).zip(observations).zip(verdicts);
         found
@@ -72,6 +68,24 @@ impl TrackClassifier<'_> {
                 Finding { track, observations, places, verdict, others }
             })
             .collect()
+    }
+
+    /// The points of the tracks of two observations, of no more than a [`Batch`] takes, that are more likely right than
+    /// wrong.
+    pub fn find_two_view_points(&self, tracks: Range<usize>) -> Vec<TwoViewPoint> {
+        let Self { problem, geometry, .. } = self;
+        let (tracks, observations): (Vec<usize>, Vec<Vec<Observation>>) = geometry
+            .judgeable(problem, tracks)
+            .filter(|(_, seen)| seen.len() == 2)
+            .map(|(track, seen)| (track, geometry.observations(problem, &seen)))
+            .unzip();
+        let batch = Batch::new(self.cameras, &observations.iter().map(Vec::as_slice).collect::<Vec<_>>());
+        let found = batch.refine(batch.linear(), |_| true, OPTIONS.point_steps);
+        let points = tracks.into_iter().zip(observations).enumerate().map(|(lane, (track, observations))| {
+            let (weight, point) = self.probability(&observations, &[0, 1], found.point(lane), found.cost(lane));
+            TwoViewPoint { track, weight, point, retained: observations }
+        });
+        points.filter(|found| found.weight > 0.5).collect()
     }
 
     /// Drops the worst observation of each track as long as it is more likely wrong than right, then weighs what
@@ -128,17 +142,29 @@ impl TrackClassifier<'_> {
         VERIFIED.max((self.least_share * observations.len() as f64).ceil() as usize)
     }
 
+    /// Probability that the track of a point is right by the observations that it retains, and the point, at infinity
+    /// where that fits.
+    ///
+    /// * `cost`: sum of their weighted squared residuals
+    fn probability(&self, observations: &[Observation], retained: &[usize], point: Point, cost: f64) -> (f64, Point) {
+        let (point, cost) = self.at_infinity_if_behind(observations, retained, point).unwrap_or((point, cost));
+        let dropped = observations.len() - retained.len();
+        // The density of a coordinate of weight w is the root of w times as high where the residual is 0, and the point
+        // takes three of the coordinates. What a lens weighs them by goes for wrong observations, too.
+        let count = 2.0 * retained.len() as f64;
+        let of_weights = retained.iter().map(|&k| self.given_weight(&observations[k]).ln()).sum::<f64>();
+        let of_weights = of_weights * (count - 3.0) / count;
+        let ln_odds = self.noise.ln_odds(cost, retained.len(), dropped, self.geometry.inlier_share) + of_weights;
+        let probability = if cost.is_finite() { 1.0 / (1.0 + (-ln_odds).exp()) } else { 0.0 };
+        (probability, point)
+    }
+
     /// The verdict on a track by the observations that it retains.
     fn weigh(&self, observations: &[Observation], retained: &[usize], point: Point, cost: f64) -> TrackVerdict {
         let gate = self.noise.gate();
-        let (point, cost) = self.at_infinity_if_behind(observations, retained, point).unwrap_or((point, cost));
-        let dropped = observations.len() - retained.len();
-        // The density of two coordinates of weight w is w times as high where the residual is 0. What a lens weighs
-        // them by goes for wrong observations, too.
-        let of_weights: f64 = retained.iter().map(|&k| self.given_weight(&observations[k]).ln()).sum();
-        let ln_odds = self.noise.ln_odds(cost, retained.len(), dropped, self.geometry.inlier_share) + of_weights;
+        let (probability, point) = self.probability(observations, retained, point, cost);
         let enough = retained.len() >= self.least_retained(observations);
-        let weight = if enough && cost.is_finite() { 1.0 / (1.0 + (-ln_odds).exp()) } else { 0.0 };
+        let weight = if enough { probability } else { 0.0 };
         let mut flags = vec![false; observations.len()];
         for &k in retained {
             flags[k] = self.seen_squared(&point, &observations[k]) <= gate;

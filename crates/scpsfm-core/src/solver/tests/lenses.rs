@@ -1,7 +1,7 @@
 //! Whole solves through lenses that are not one known pinhole: distortion, a zoom, a focal length known beforehand.
 
 use super::*;
-use crate::domain::{Calibration, FocalPrior, LensProjection};
+use crate::domain::{Calibration, FocalPrior, LeftOut, LensProjection};
 use crate::evaluation::bound::of_photographed;
 use crate::synthetic::Photographed;
 use crate::synthetic::photographed::{
@@ -138,17 +138,23 @@ fn several_cameras_that_are_declared_as_one_are_not_metric_without_a_warning() {
     }
 }
 
-/// Two cameras that took pictures in turn, declared as one: METRIC, 34 % off, and WEAK, 41 % off at a sigma of 5 %, while
-/// only the ratio to projective cameras asked whether a focal length a view fits better.
+/// Two cameras that took pictures in turn, declared as one: METRIC, 34 % off, and WEAK, 41 % off at a sigma of 5 %,
+/// while only the ratio to projective cameras asked whether a focal length a view fits better. Of the third the views
+/// of the other camera had poses that a tenth of what they see agreed with.
 #[test]
 fn no_view_of_two_cameras_that_are_declared_as_one_refutes_the_focal_length() {
-    for seed in [910_018, 910_034] {
+    for seed in [910_018, 910_034, 910_089] {
         let scene = Photographed::generate(&PhotographedOptions::drawn(seed)).expect("valid");
         let mut raw = scene.input.clone();
         raw.views.iter_mut().for_each(|view| view.camera_group = 0);
         let input = Input::new(raw, &Limits::default(), "scene").expect("valid");
         let solution = solved(&input, &SolveSettings::default());
         println!("seed {seed}: {:?}, {:?}", solution.grade, solution.warnings);
+        if seed == 910_089 {
+            let few = |reason| matches!(reason, LeftOut::NotRegistered { points, agreeing } if 3 * agreeing < points);
+            let contradicted = solution.views.iter().filter(|view| view.left_out.is_some_and(few)).count();
+            assert_eq!((solution.grade, contradicted), (Some(Grade::Metric), 17));
+        }
         let Some(calibration) = solution.calibrations.first() else { continue };
         let sigma = calibration.sigma_log_focal.unwrap_or(f64::INFINITY);
         for view in solution.registered_views() {

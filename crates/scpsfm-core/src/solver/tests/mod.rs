@@ -10,6 +10,7 @@ mod second_structures;
 mod sequences;
 mod special_scenes;
 mod triplets;
+mod two_views;
 
 use super::*;
 use crate::domain::{
