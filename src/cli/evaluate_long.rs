@@ -18,9 +18,9 @@ pub const SEEDS: u64 = 1;
 #[command(next_help_heading = "Long sequences")]
 pub struct LongArgs {
     /// Solve a drive, a corridor, an aerial grid and a walk around of 60, 120, 250 and 500 views, up to a million
-    /// observations, instead of the sweeps, one after the other (TIME). A table shows how grade, error, time and memory
-    /// go with the length. Writes long.json, and long.jsonl, with which it goes on where it was
-    /// stopped. --scenes TEXT takes the motions whose name holds the text
+    /// observations, instead of the sweeps, one after the other (ten minutes). A table shows how grade, error, time and
+    /// memory go with the length. Writes long.json, and long.jsonl, with which it goes on where it was stopped.
+    /// --scenes TEXT takes the motions whose name holds the text
     #[arg(long, group = "suite", conflicts_with_all = ["threads", "real", "quick", "sweeps", "beyond", "ablation",
         "depths", "methods", "paper_width"])]
     pub long: bool,

@@ -22,6 +22,7 @@ use crate::geometry::triangulation::batch::LANES;
 use crate::geometry::{Camera, Point};
 use crate::solver::per_track::{BATCH, TRACKS_A_RUN, WORTH_A_THREAD};
 use crate::solver::problem::{LEAST_RETAINED_SHARE, Problem};
+use crate::solver::view_selection::LEAST_VIEWS;
 use track_classifier::{Finding, TrackClassifier};
 
 const OPTIONS: ClassificationOptions = ClassificationOptions::DEFAULT;
@@ -208,9 +209,9 @@ fn of_each_track<T: Send>(
 }
 
 impl Judged {
-    /// The views that keep too few of the observations of right tracks, each with how many of them it has and keeps: the
-    /// pose of a view behind another lens than its own agrees with a few of its points. None where most views do so: then
-    /// they are more likely right than what judged them.
+    /// The views that keep too few of the observations of right tracks, each with how many of them it has and keeps:
+    /// the pose of a view behind another lens than its own agrees with a few of its points. None where most views do
+    /// so, which then are more likely right than what judged them, or where too few views would be left.
     pub fn contradicted_views(&self, problem: &Problem) -> Vec<(usize, LeftOut)> {
         let of_view = |view: usize| {
             let seen = problem.of_view[view].iter().map(|&k| k as usize);
@@ -226,7 +227,8 @@ impl Judged {
         };
         let registered = (0..problem.views()).filter(|&view| of_view(view).0 > 0).count();
         let found: Vec<(usize, LeftOut)> = (0..problem.views()).filter_map(few).collect();
-        if 2 * found.len() > registered { Vec::new() } else { found }
+        let left = registered - found.len();
+        if left < found.len().max(LEAST_VIEWS) { Vec::new() } else { found }
     }
 
     /// Nothing judged yet.
