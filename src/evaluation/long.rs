@@ -5,8 +5,9 @@ use std::fmt::Write;
 
 use serde::Serialize;
 
-use crate::domain::Grade;
-use crate::evaluation::observations::{Focals, Measured, Records, Run};
+use crate::evaluation::observations::{self, FocalError, Measured, Records, Run};
+use crate::evaluation::real::Side;
+use crate::statistics::median;
 use crate::synthetic::photographed::{PhotographedMotion, PhotographedOptions};
 
 /// Views of the sequences.
@@ -47,51 +48,33 @@ impl Plan {
     }
 }
 
-/// A motion at one length; means over the seeds unless said.
+/// A motion at one length.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct Row {
     pub motion: &'static str,
     pub views: usize,
-    pub seeds: usize,
+    /// Observations, a mean over the seeds.
     pub observations: f64,
-    /// Answers by grade.
-    pub metric: usize,
-    pub weak: usize,
-    /// Of the METRIC and WEAK ones.
-    pub focals: Focals,
+    pub answers: observations::Row,
     /// Largest error of a focal length in its standard deviations.
     pub largest_deviation: Option<f64>,
     /// Median of the absolute trajectory error over the length of the true path.
     pub trajectory_error: Option<f64>,
-    /// Share of the views that are in the largest reconstruction.
-    pub registered: f64,
-    pub precision: f64,
-    pub recall: f64,
-    pub seconds: f64,
-    /// Largest.
+    /// Largest memory of the process during a solve.
     pub peak_bytes: Option<u64>,
 }
 
 impl Row {
     fn of(motion: &'static str, views: usize, here: &[&Measured]) -> Self {
-        let mean = |value: fn(&Measured) -> f64| here.iter().map(|one| value(one)).sum::<f64>() / here.len() as f64;
-        let of = |grade: Grade| here.iter().filter(|one| one.grade == Some(grade)).count();
-        let focals = || here.iter().flat_map(|one| &one.focals);
+        let deviation = |focal: &FocalError| Some(focal.log_error.abs() / focal.sigma?);
         let mut errors: Vec<f64> = here.iter().filter_map(|one| one.trajectory_error).collect();
         Self {
             motion,
             views,
-            seeds: here.len(),
-            observations: mean(|one| one.given as f64),
-            metric: of(Grade::Metric),
-            weak: of(Grade::Weak),
-            focals: Focals::of(focals()),
-            largest_deviation: focals().filter_map(|focal| Some(focal.log_error.abs() / focal.sigma?)).reduce(f64::max),
-            trajectory_error: (!errors.is_empty()).then(|| crate::statistics::median(&mut errors)),
-            registered: mean(|one| one.views),
-            precision: mean(|one| one.precision),
-            recall: mean(|one| one.recall),
-            seconds: mean(|one| one.seconds),
+            observations: here.iter().map(|one| one.given as f64).sum::<f64>() / here.len() as f64,
+            answers: observations::Row::of(motion, Side::Scpsfm, here),
+            largest_deviation: here.iter().flat_map(|one| &one.focals).filter_map(deviation).reduce(f64::max),
+            trajectory_error: (!errors.is_empty()).then(|| median(&mut errors)),
             peak_bytes: here.iter().filter_map(|one| one.peak_bytes).max(),
         }
     }
@@ -131,25 +114,26 @@ pub fn text(rows: &[Row]) -> String {
         |value: Option<f64>, digits: usize| value.map_or_else(|| "-".into(), |value| format!("{value:.digits$}"));
     let percent = |share: Option<f64>| shown(share.map(|share| 100.0 * share), 3);
     for row in rows {
+        let Row { answers, .. } = row;
         let _ = writeln!(
             text,
             "{:<13}{:>6}{:>5}{:>10.0}{:>6}{:>6}{:>9}{:>9}{:>8}{:>8}{:>9}{:>8.3}{:>7.3}{:>7.3}{:>9.2}{:>8.1}{:>7}",
             row.motion,
             row.views,
-            row.seeds,
+            answers.seeds,
             row.observations,
-            row.metric,
-            row.weak,
-            percent(row.focals.median_error),
-            percent(row.focals.median_sigma),
+            answers.metric,
+            answers.calibrated - answers.metric,
+            percent(answers.calibrated_focals.median_error),
+            percent(answers.calibrated_focals.median_sigma),
             shown(row.largest_deviation, 2),
-            shown(row.focals.sigma_over_bound, 2),
+            shown(answers.calibrated_focals.sigma_over_bound, 2),
             percent(row.trajectory_error),
-            row.registered,
-            row.precision,
-            row.recall,
-            row.seconds,
-            1e6 * row.seconds / row.observations,
+            answers.views,
+            answers.precision,
+            answers.recall,
+            answers.seconds,
+            1e6 * answers.seconds / row.observations,
             shown(row.peak_bytes.map(|bytes| bytes as f64 / 1e6), 0)
         );
     }
@@ -159,7 +143,7 @@ pub fn text(rows: &[Row]) -> String {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::evaluation::observations::FocalError;
+    use crate::domain::Grade;
     use crate::synthetic::photographed::long::MOTIONS;
 
     #[test]
@@ -182,8 +166,8 @@ mod tests {
         };
         let (one, other) = (answer(0.001, 0.1, 5_000_000), answer(-0.025, 0.3, 7_000_000));
         let row = Row::of("drive", 60, &[&one, &other]);
-        assert_eq!((row.metric, row.weak, row.seeds, row.observations), (2, 0, 2, 1_000.0));
-        assert_eq!((row.largest_deviation, row.focals.sigma_over_bound), (Some(2.5), Some(2.0)));
+        assert_eq!((row.answers.metric, row.answers.seeds, row.observations), (2, 2, 1_000.0));
+        assert_eq!((row.largest_deviation, row.answers.calibrated_focals.sigma_over_bound), (Some(2.5), Some(2.0)));
         assert!(matches!(row.trajectory_error, Some(0.1 | 0.3)) && row.peak_bytes == Some(7_000_000));
         let text = text(&[row]);
         assert!(text.lines().nth(1).is_some_and(|line| line.contains(" 2000.0 ") && line.ends_with(" 7")), "{text}");

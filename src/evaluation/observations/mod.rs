@@ -213,8 +213,7 @@ pub struct Focals {
 }
 
 impl Focals {
-    /// Of these.
-    pub fn of<'a>(focals: impl Iterator<Item = &'a FocalError>) -> Self {
+    fn of<'a>(focals: impl Iterator<Item = &'a FocalError>) -> Self {
         let focals: Vec<&FocalError> = focals.collect();
         let some = |mut values: Vec<f64>| (!values.is_empty()).then(|| median(&mut values));
         let errors: Vec<f64> = focals.iter().map(|focal| focal.log_error.abs()).collect();
@@ -309,7 +308,7 @@ impl Plan {
                 let pair = |seed| Some(of(seed, Side::Scpsfm)?.f1 - of(seed, Side::Peer)?.f1);
                 let gains: Vec<f64> = (0..self.seeds).filter_map(pair).collect();
                 let f1_gain = if side == Side::Scpsfm && !self.peer.is_empty() { interval(&gains) } else { None };
-                rows.push(Row { f1_gain, ..row(&condition.name, side, &here) });
+                rows.push(Row { f1_gain, ..Row::of(&condition.name, side, &here) });
             }
         }
         rows
@@ -335,28 +334,31 @@ pub fn measure(run: &Run, stop: &StopToken) -> Result<Option<Measured>, String> 
     }))
 }
 
-fn row(condition: &str, side: Side, here: &[&Measured]) -> Row {
-    let mean =
-        |value: fn(&Measured) -> f64| here.iter().map(|measured| value(measured)).sum::<f64>() / here.len() as f64;
-    let count = |wanted: &dyn Fn(&Measured) -> bool| here.iter().filter(|measured| wanted(measured)).count();
-    Row {
-        condition: condition.to_owned(),
-        side,
-        seeds: here.len(),
-        f1: mean(|measured| measured.f1),
-        precision: mean(|measured| measured.precision),
-        recall: mean(|measured| measured.recall),
-        observation_f1: mean(Measured::observation_f1),
-        views: mean(|measured| measured.views),
-        calibrated: count(&|measured| !measured.focals.is_empty()),
-        metric: count(&Measured::is_metric),
-        mismatch: count(&|measured| measured.is_metric() && measured.mismatch),
-        metric_focals: Focals::of(here.iter().filter(|measured| measured.is_metric()).flat_map(|one| &one.focals)),
-        calibrated_focals: Focals::of(here.iter().flat_map(|one| &one.focals)),
-        wrong: count(&|measured| measured.is_metric() && measured.focals.iter().any(FocalError::is_wrong)),
-        seconds: mean(|measured| measured.seconds),
-        failures: here.iter().filter_map(|measured| measured.failure.clone()).collect(),
-        f1_gain: None,
+impl Row {
+    /// Of these answers of one side, of which there is one at least; nothing is compared with the other.
+    pub fn of(condition: &str, side: Side, here: &[&Measured]) -> Self {
+        let mean =
+            |value: fn(&Measured) -> f64| here.iter().map(|measured| value(measured)).sum::<f64>() / here.len() as f64;
+        let count = |wanted: &dyn Fn(&Measured) -> bool| here.iter().filter(|measured| wanted(measured)).count();
+        Self {
+            condition: condition.to_owned(),
+            side,
+            seeds: here.len(),
+            f1: mean(|measured| measured.f1),
+            precision: mean(|measured| measured.precision),
+            recall: mean(|measured| measured.recall),
+            observation_f1: mean(Measured::observation_f1),
+            views: mean(|measured| measured.views),
+            calibrated: count(&|measured| !measured.focals.is_empty()),
+            metric: count(&Measured::is_metric),
+            mismatch: count(&|measured| measured.is_metric() && measured.mismatch),
+            metric_focals: Focals::of(here.iter().filter(|measured| measured.is_metric()).flat_map(|one| &one.focals)),
+            calibrated_focals: Focals::of(here.iter().flat_map(|one| &one.focals)),
+            wrong: count(&|measured| measured.is_metric() && measured.focals.iter().any(FocalError::is_wrong)),
+            seconds: mean(|measured| measured.seconds),
+            failures: here.iter().filter_map(|measured| measured.failure.clone()).collect(),
+            f1_gain: None,
+        }
     }
 }
 

@@ -79,16 +79,16 @@ pub fn warnings(views: &[ViewResult], name: impl Fn(usize) -> String) -> Vec<War
     let mut details = Vec::new();
     if !unregistered.is_empty() {
         let named = unregistered.iter().map(|(view, reason)| format!("{} ({reason})", name(*view)));
+        let contradicted = unregistered.iter().filter(|(_, reason)| reason.is_contradicted()).count();
+        let hint = match contradicted >= LEAST_CONTRADICTED_VIEWS {
+            true => "; views that see many points of which few agree may be of another camera or zoom",
+            false => "",
+        };
         details.push(format!(
-            "{} of {observed} views could not be registered: {}",
+            "{} of {observed} views could not be registered: {}{hint}",
             unregistered.len(),
             listed(named, MOST_LISTED)
         ));
-        let is_contradicted = |(_, reason): &&(usize, LeftOut)| reason.is_contradicted();
-        if unregistered.iter().filter(is_contradicted).count() >= LEAST_CONTRADICTED_VIEWS {
-            let last = details.len() - 1;
-            details[last].push_str("; views that see many points of which few agree may be of another camera or zoom");
-        }
     }
     if !outside.is_empty() {
         details.push(format!(

@@ -218,15 +218,16 @@ impl Judged {
             let right = seen.filter(|&k| self.tracks.inlier[problem.track_of(k)]);
             let right = right.map(|k| problem.input.caller_index(k));
             let judged: Vec<usize> = right.filter(|&k| self.observations.residual_px[k].is_some()).collect();
-            (judged.len(), judged.iter().filter(|&&k| self.observations.inlier[k]).count())
+            let kept = judged.iter().filter(|&&k| self.observations.inlier[k]).count();
+            (!judged.is_empty()).then_some((view, judged.len(), kept))
         };
-        let few = |view: usize| {
-            let (points, agreeing) = of_view(view);
-            let is_few = (agreeing as f64) < OPTIONS.least_kept_share * points as f64;
-            is_few.then_some((view, LeftOut::NotRegistered { points: points as u32, agreeing: agreeing as u32 }))
+        let views: Vec<(usize, usize, usize)> = (0..problem.views()).filter_map(of_view).collect();
+        let registered = views.len();
+        let few = |(view, points, kept): (usize, usize, usize)| {
+            let reason = LeftOut::NotRegistered { points: points as u32, agreeing: kept as u32 };
+            ((kept as f64) < OPTIONS.least_kept_share * points as f64).then_some((view, reason))
         };
-        let registered = (0..problem.views()).filter(|&view| of_view(view).0 > 0).count();
-        let found: Vec<(usize, LeftOut)> = (0..problem.views()).filter_map(few).collect();
+        let found: Vec<(usize, LeftOut)> = views.into_iter().filter_map(few).collect();
         let left = registered - found.len();
         if left < found.len().max(LEAST_VIEWS) { Vec::new() } else { found }
     }

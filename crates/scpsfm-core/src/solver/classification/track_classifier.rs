@@ -79,6 +79,9 @@ impl TrackClassifier<'_> {
             .filter(|(_, seen)| seen.len() == 2)
             .map(|(track, seen)| (track, geometry.observations(problem, &seen)))
             .unzip();
+        if tracks.is_empty() {
+            return Vec::new();
+        }
         let batch = Batch::new(self.cameras, &observations.iter().map(Vec::as_slice).collect::<Vec<_>>());
         let found = batch.refine(batch.linear(), |_| true, OPTIONS.point_steps);
         let points = tracks.into_iter().zip(observations).enumerate().map(|(lane, (track, observations))| {
