@@ -33,8 +33,9 @@ Examples:
   scpsfm solve kitti.csv --width 1242 --height 375 --window 11 --out windows   # the paper's KITTI protocol
 
 Files in the output directory: result.json (the summary), tracks.csv, observations.csv (every answer under the ids \
-of the input), cameras.json, points.ply (where there are several parts: of the largest; points-part-1.ply and on hold the \
-others) and report.html (open it in a browser).";
+of the input), cameras.json, points.ply (where there are several parts: of the largest; points-part-1.ply and on hold \
+the others), report.html (open it in a browser), and where there are such points-two-view.ply (consistent tracks of two \
+views) and second-structures.json (bodies that move by themselves).";
 
 /// Solve one input
 ///

@@ -1,9 +1,10 @@
 //! A result in a few lines for people.
 
 use super::next_steps::{self, Files};
+use crate::domain::result::SecondStructureKind;
 use crate::domain::{Grade, Method, Solution, Status};
-use crate::formats::result_json::{CameraGroupJson, camera_groups};
-use crate::formats::{LabelledInput, result_files, warnings};
+use crate::formats::result_json::{CameraGroupJson, SecondStructureCounts, camera_groups};
+use crate::formats::{LabelledInput, result_files, second_structures, warnings};
 use crate::solver::VERIFIED;
 
 /// Cameras told one by one; a photo collection may have one an image, and result.json has them all.
@@ -52,6 +53,9 @@ pub fn text(solution: &Solution, input: Option<&LabelledInput>) -> String {
             "two views",
             format!("{count} tracks that two views of a part see are consistent with these; none is verified"),
         );
+    }
+    for counts in second_structures::counts(solution) {
+        fact(&format!("structure {} ", counts.number), structure(&counts));
     }
     if !solution.splits.is_empty() {
         fact("splits", format!("{} further points in tracks that join several", solution.splits.len()));
@@ -134,6 +138,17 @@ fn parts(solution: &Solution) -> Option<String> {
     Some(format!("{count}, of {} views, each with a frame and a scale of its own", each.join(", ")))
 }
 
+/// What is known of a second structure.
+fn structure(counts: &SecondStructureCounts) -> String {
+    let kind = match counts.kind {
+        Some(SecondStructureKind::MovingBody) => ", a moving body",
+        Some(SecondStructureKind::RepeatedStructure) => ", a repeated structure or a body that stands still at times",
+        None => "",
+    };
+    let poses = if counts.views > 0 { format!("posed in {} views", counts.views) } else { "no poses".to_owned() };
+    format!("{} tracks{kind}, {poses}", counts.tracks)
+}
+
 /// What is known of one camera of several.
 fn camera(camera: &CameraGroupJson) -> String {
     let views = format!("{} of {} views", camera.registered_views, camera.views);
@@ -156,6 +171,7 @@ fn focal(focal_px: f64, sigma_log: Option<f64>) -> String {
 #[cfg(test)]
 mod tests {
     use super::{Files, text, text_with_files};
+    use crate::domain::result::{SecondStructure, SecondStructureKind, StructurePose};
     use crate::domain::{Calibration, Grade};
     use crate::formats::fixture;
 
@@ -194,6 +210,30 @@ mod tests {
     #[test]
     fn tells_of_tracks_that_join_points() {
         assert!(text(&fixture::solved_with_a_split().1, None).contains("splits       1 further points"));
+    }
+
+    #[test]
+    fn tells_how_second_structures_move() {
+        let (_, mut solution) = fixture::solved();
+        solution.tracks.second_structure = (0..40).map(|track| u32::from(track < 3)).collect();
+        let rotation = [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]];
+        let poses: Vec<StructurePose> =
+            (0..2).map(|view| StructurePose { view, rotation, translation: [0.0; 3] }).collect();
+        let mut said = |kind, poses: &[StructurePose]| {
+            let structure = SecondStructure { number: 1, kind, poses: poses.to_vec(), points: Vec::new() };
+            solution.second_structures = vec![structure];
+            let lines = text(&solution, None);
+            lines.lines().find(|line| line.starts_with("  structure")).expect("a line").to_owned()
+        };
+        assert_eq!(
+            said(Some(SecondStructureKind::MovingBody), &poses),
+            "  structure 1  3 tracks, a moving body, posed in 2 views"
+        );
+        assert_eq!(
+            said(Some(SecondStructureKind::RepeatedStructure), &[]),
+            "  structure 1  3 tracks, a repeated structure or a body that stands still at times, no poses"
+        );
+        assert_eq!(said(None, &poses), "  structure 1  3 tracks, posed in 2 views");
     }
 
     #[test]

@@ -223,6 +223,7 @@ fn solution(scene: &Scene) -> Solution {
         },
         splits: Vec::new(),
         two_view_tracks: Vec::new(),
+        second_structures: Vec::new(),
         noise_px: Some(3.1),
         reprojection_rms_px: Some((kept.iter().map(|r| r * r).sum::<f64>() / kept.len() as f64).sqrt()),
         reprojection_mean_px: Some(kept.iter().sum::<f64>() / kept.len() as f64),

@@ -20,6 +20,7 @@ pub mod ply;
 pub mod publish;
 pub mod result_files;
 pub mod result_json;
+pub mod second_structures;
 pub mod source;
 mod text;
 pub mod view_table;

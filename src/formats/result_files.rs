@@ -8,6 +8,7 @@ use super::cameras_json::CamerasJson;
 use super::export::NotExported;
 use super::publish::{Draft, pretty};
 use super::result_json::{ResultJson, track_label, view_label};
+use super::second_structures::SecondStructuresJson;
 use super::{Export, LabelledInput, export, manifest, ply};
 use crate::domain::{Solution, Status};
 use crate::report;
@@ -19,6 +20,7 @@ pub const OBSERVATIONS: &str = "observations.csv";
 pub const CAMERAS: &str = "cameras.json";
 pub const POINTS: &str = "points.ply";
 pub const TWO_VIEW_POINTS: &str = "points-two-view.ply";
+pub const SECOND_STRUCTURES: &str = "second-structures.json";
 pub const REPORT: &str = "report.html";
 pub const RESULT: &str = "result.json";
 
@@ -58,6 +60,9 @@ pub fn write(
     if let Some(points) = ply::two_view_points(solution, input) {
         draft.add(TWO_VIEW_POINTS, points.as_bytes())?;
     }
+    if !solution.second_structures.is_empty() {
+        draft.add(SECOND_STRUCTURES, pretty(&SecondStructuresJson::new(solution, input))?.as_bytes())?;
+    }
     draft.add(REPORT, report::page(solution, input).as_bytes())?;
     let refused = match input {
         Some(input) => export::add(&mut draft, exports, solution, input)?,
@@ -71,7 +76,8 @@ pub fn write(
 pub fn replaced(directory: &Path, exports: &[Export], input: &Path) -> Option<PathBuf> {
     let input = input.canonicalize().ok()?;
     let names =
-        [TRACKS, OBSERVATIONS, CAMERAS, POINTS, TWO_VIEW_POINTS, REPORT, RESULT, manifest::NAME].map(PathBuf::from);
+        [TRACKS, OBSERVATIONS, CAMERAS, POINTS, TWO_VIEW_POINTS, SECOND_STRUCTURES, REPORT, RESULT, manifest::NAME]
+            .map(PathBuf::from);
     let folders = exports.iter().flat_map(|export| {
         let folder = PathBuf::from(export.folder());
         let files: Vec<PathBuf> = export.inputs().iter().map(|file| folder.join(file)).collect();

@@ -2,10 +2,10 @@
 
 use serde::Serialize;
 
-use crate::domain::result::ProposalTime;
+use crate::domain::result::{ProposalTime, SecondStructureKind};
 use crate::domain::{Calibration, Grade, LensProjection, Method, Solution, Status, Warning, WarningCode};
 
-use super::{Label, LabelledInput, warnings};
+use super::{Label, LabelledInput, second_structures, warnings};
 
 /// The summary of a result.
 ///
@@ -51,6 +51,8 @@ pub struct ResultJson {
     pub split_points: usize,
     /// Tracks that two registered views of one part see and that are consistent with these.
     pub two_view_tracks: usize,
+    /// The rigid motions that `SECOND_STRUCTURE` reports, by number.
+    pub second_structures: Vec<SecondStructureCounts>,
     pub registered_views: usize,
     pub reprojection_rms_px: Option<f64>,
     pub reprojection_mean_px: Option<f64>,
@@ -102,6 +104,19 @@ pub struct CameraGroupJson {
     pub grade: Option<Grade>,
     /// Codes of the warnings that are of this group, each once.
     pub warnings: Vec<WarningCode>,
+}
+
+/// A second structure; `second-structures.json` holds its poses and points.
+#[derive(Debug, Clone, Serialize)]
+pub struct SecondStructureCounts {
+    /// As the column `second_structure` of `tracks.csv` has it.
+    pub number: u32,
+    /// Null: it has no poses, or a kind that this version does not know.
+    pub kind: Option<SecondStructureKind>,
+    /// Counts: its tracks, the views that have a pose against it, and its points.
+    pub tracks: usize,
+    pub views: usize,
+    pub points: usize,
 }
 
 /// Seconds spent in a stage.
@@ -201,6 +216,7 @@ impl ResultJson {
             inlier_observations: solution.inlier_observation_count(),
             split_points: solution.splits.len(),
             two_view_tracks: solution.two_view_tracks.len(),
+            second_structures: second_structures::counts(solution),
             registered_views: solution.registered_views().len(),
             reprojection_rms_px: solution.reprojection_rms_px,
             reprojection_mean_px: solution.reprojection_mean_px,

@@ -32,8 +32,10 @@ __all__ = [
     "Result",
     "ResultStatus",
     "ResultWarning",
+    "SecondStructure",
     "Split",
     "TrackResults",
+    "TwoViewTracks",
 ]
 
 Floats = NDArray[np.float64]
@@ -99,6 +101,12 @@ def _row(values: Any, kind: Any, expected: int | None = None, what: str = "") ->
     array = np.array(values, dtype=kind)
     if expected is not None and len(array) != expected:
         raise InternalError(f"the result has {len(array)} {what} where {expected} are due", reason="INVALID_RESULT")
+    array.setflags(write=False)
+    return array
+
+
+def _rows(values: Any, width: int, what: str) -> Floats:
+    array = np.array([_row(row, np.float64, width, what) for row in values], dtype=np.float64).reshape(-1, width)
     array.setflags(write=False)
     return array
 
@@ -353,6 +361,41 @@ class TwoViewTracks:
 
     points: Floats
     """X, Y, Z in the frame of that part; NaN at infinity. (tracks, 3)."""
+
+
+@dataclass(frozen=True, eq=False)
+class SecondStructure:
+    """A rigid motion of its own, of tracks that are no inliers.
+
+    Poses and points are in a frame and a scale of the structure's own. With the pose (R, t) of a view in the scene and
+    its pose (Rs, ts) against the structure, a point X of the structure is at R^T (s (Rs X + ts) - t) in the scene at
+    that view, for a positive scale s, the same for all views, that images do not determine.
+    """
+
+    number: int
+    """As `TrackResults.second_structure_number` has it, from 1."""
+
+    kind: str | None
+    """`MOVING_BODY` (between most pairs of its views it moves) or `REPEATED_STRUCTURE` (between a fifth of them or more
+    it stands still: copies of one part of the scene, or a body that stood still for a while).
+
+    `None`: it has no poses, or this version does not know the kind."""
+
+    view: NDArray[np.int64]
+    """Index of each view that has a pose in its frame, in rising order. (views,). Empty without a metric result, and
+    where its tracks make no reconstruction under the calibration."""
+
+    R: Floats
+    """Rotation of each, x ~ K (R X + t). (views, 3, 3)."""
+
+    t: Floats
+    """Translation of each. (views, 3)."""
+
+    track: NDArray[np.int64]
+    """Index of each track that has a point, in rising order. (points,)."""
+
+    points: Floats
+    """X, Y, Z of each of these. (points, 3)."""
 
 
 class Result:
@@ -638,6 +681,11 @@ class Result:
             points=row.reshape(len(found), 3),
         )
 
+    @cached_property
+    def second_structures(self) -> tuple[SecondStructure, ...]:
+        """The rigid motions that `SECOND_STRUCTURE` reports, by number."""
+        return tuple(_second_structure(message) for message in self.message.second_structures)
+
     def to_colmap_database(self, path: str | PathLike[str]) -> None:
         """Writes a COLMAP database of the right observations; see `scpsfm.to_colmap_database`."""
         from .exports import to_colmap_database
@@ -660,6 +708,20 @@ class Result:
         if self.input is None:
             raise InvalidArgument("exports need the input: result.with_tracks(tracks)", reason="NO_INPUT")
         return self.input
+
+
+def _second_structure(message: result_pb2.SecondStructure) -> SecondStructure:
+    kind = word(result_pb2.SecondStructureKind, message.kind, "SECOND_STRUCTURE_KIND_")
+    poses, points = message.poses, message.points
+    return SecondStructure(
+        number=message.number,
+        kind=None if kind.startswith(("UNSPECIFIED", "UNKNOWN")) else kind,
+        view=_row([pose.view_index for pose in poses], np.int64),
+        R=_rows([pose.rotation for pose in poses], 9, "numbers in a rotation").reshape(len(poses), 3, 3),
+        t=_rows([pose.translation for pose in poses], 3, "numbers in a translation"),
+        track=_row([point.track_index for point in points], np.int64),
+        points=_rows([point.point for point in points], 3, "coordinates of a point"),
+    )
 
 
 def _calibration(message: result_pb2.Calibration) -> Calibration:

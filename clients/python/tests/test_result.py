@@ -200,6 +200,38 @@ def test_tracks_of_two_views_are_told(small: scene.Scene) -> None:
         _ = Result(message).two_view_tracks
 
 
+def test_second_structures_are_told(small: scene.Scene) -> None:
+    message = scene.true_result(small)
+    assert Result(message).second_structures == ()
+    moving = message.second_structures.add(number=1, kind=result_pb2.SECOND_STRUCTURE_KIND_MOVING_BODY)
+    for view in (0, 2):
+        moving.poses.add(view_index=view, rotation=small.R[view].ravel(), translation=small.t[view])
+    moving.points.add(track_index=3, point=[1.0, 2.0, 3.0])
+    message.second_structures.add(number=2)
+    message.second_structures.add(number=3, kind=77)  # type: ignore[arg-type]
+    first, second, third = Result(message).second_structures
+    assert (first.number, first.kind, first.view.tolist(), first.track.tolist()) == (1, "MOVING_BODY", [0, 2], [3])
+    assert np.array_equal(first.R, small.R[[0, 2]])
+    assert np.array_equal(first.t, small.t[[0, 2]])
+    assert first.points.tolist() == [[1, 2, 3]]
+    for array in (first.view, first.R, first.t, first.track, first.points):
+        with pytest.raises(ValueError, match="read-only"):
+            array[0] = 0
+    assert (second.number, second.kind, third.kind) == (2, None, None)
+    assert (second.R.shape, second.t.shape, second.points.shape) == ((0, 3, 3), (0, 3), (0, 3))
+    for change, words in (
+        (lambda pose: pose.rotation.pop(), "numbers in a rotation"),
+        (lambda pose: pose.translation.pop(), "numbers in a translation"),
+    ):
+        wrong = result_pb2.JobResult.FromString(message.SerializeToString())
+        change(wrong.second_structures[0].poses[1])
+        with pytest.raises(scpsfm.InternalError, match=words):
+            _ = Result(wrong).second_structures
+    moving.points[0].point.append(4.0)
+    with pytest.raises(scpsfm.InternalError, match="coordinates of a point"):
+        _ = Result(message).second_structures
+
+
 def test_a_result_is_saved_and_loaded(small: scene.Scene, tmp_path: Path) -> None:
     result = Result(scene.true_result(small), small.tracks)
     result.save(tmp_path / "r.pb")

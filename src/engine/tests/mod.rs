@@ -144,6 +144,7 @@ fn solution(input: &Input, call: u64) -> Solution {
         observations: Default::default(),
         splits: Vec::new(),
         two_view_tracks: Vec::new(),
+        second_structures: Vec::new(),
         noise_px: None,
         reprojection_rms_px: Some(0.5),
         reprojection_mean_px: None,

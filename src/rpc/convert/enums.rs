@@ -1,6 +1,7 @@
 //! Enums: the domain's and the wire's have the same variants, but for the wire's `UNSPECIFIED`.
 
 use crate::domain::job::{AttemptEnd, JobState};
+use crate::domain::result::SecondStructureKind;
 use crate::domain::{
     Backend, Grade, LensProjection, Method, Phase, Proposal, Stage, Status, Task, Violation, WarningCode, WebhookState,
 };
@@ -64,6 +65,7 @@ twins! {
     Status = ResultStatus { Solved, NoReconstruction }
     Grade = Grade { Metric, Weak, ProjectiveOnly }
     LensProjection = LensProjection { Perspective, Fisheye }
+    SecondStructureKind = SecondStructureKind { MovingBody, RepeatedStructure }
     Proposal = Proposal { Network, Irls, Consistency, Rigidity, Uniform, Learned }
     JobState = JobState { Queued, Running, Succeeded, Failed, Cancelled, DeadlineExceeded }
     AttemptEnd = AttemptEnd { Ended, GivenBack, Lost }

@@ -14,6 +14,7 @@ pub mod matrix;
 pub mod names;
 pub mod progress;
 pub mod result;
+mod second_structures;
 pub mod settings;
 mod time;
 pub mod upload;

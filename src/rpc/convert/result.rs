@@ -4,7 +4,7 @@ use prost::Message;
 
 use super::enums::{Twin, optional_to_wire};
 use super::time::{duration_to_wire, seconds_from_wire};
-use super::{progress, required};
+use super::{progress, required, second_structures};
 use crate::domain::job::JobName;
 use crate::domain::result::{
     ObservationResults, ProposalTime, Sigmas, StageTime, TrackResults, TrackSplit, TwoViewTrack, ViewResult,
@@ -37,6 +37,7 @@ fn to_wire(name: &JobName, solution: &Solution) -> proto::JobResult {
         observations: Some(observations_to_wire(&solution.observations)),
         track_splits: solution.splits.iter().map(split_to_wire).collect(),
         two_view_tracks: solution.two_view_tracks.iter().map(two_view_track_to_wire).collect(),
+        second_structures: solution.second_structures.iter().map(second_structures::to_wire).collect(),
         noise_px: solution.noise_px,
         reprojection_rms_px: solution.reprojection_rms_px,
         reprojection_mean_px: solution.reprojection_mean_px,
@@ -83,6 +84,11 @@ pub fn from_wire(result: proto::JobResult) -> Result<Solution, Violation> {
         observations: observations_from_wire(required(result.observations, "observations")?)?,
         splits: result.track_splits.iter().enumerate().map(split_from_wire).collect::<Result<_, _>>()?,
         two_view_tracks: two_view_tracks_from_wire(&result.two_view_tracks, tracks.weight.len())?,
+        second_structures: second_structures::from_wire(
+            &result.second_structures,
+            result.views.len(),
+            tracks.weight.len(),
+        )?,
         tracks,
         noise_px: result.noise_px,
         reprojection_rms_px: result.reprojection_rms_px,
@@ -264,7 +270,7 @@ fn view_from_wire((index, view): (usize, &proto::ViewResult)) -> Result<ViewResu
 }
 
 /// Three rows of `N` numbers each, or none at all.
-fn rows<const N: usize>(numbers: &[f64]) -> Result<Option<[[f64; N]; 3]>, ()> {
+pub(super) fn rows<const N: usize>(numbers: &[f64]) -> Result<Option<[[f64; N]; 3]>, ()> {
     if numbers.is_empty() {
         return Ok(None);
     }
@@ -297,15 +303,21 @@ fn two_view_tracks_from_wire(found: &[proto::TwoViewTrack], count: usize) -> Res
     let mut next = 0;
     let track = |(index, found): (usize, &proto::TwoViewTrack)| {
         let proto::TwoViewTrack { track_index: track, weight, part, ref point } = *found;
-        if !(next..count).contains(&(track as usize)) {
-            let what = format!("track {track} is not in rising order within the {count} tracks");
-            return Err(Violation::at("two_view_tracks.track_index", index, what));
-        }
-        next = track as usize + 1;
+        in_rising_order(track, &mut next, count, "track")
+            .map_err(|what| Violation::at("two_view_tracks.track_index", index, what))?;
         let point = point_from_wire(point, "two_view_tracks.point", index)?;
         Ok(TwoViewTrack { track, weight, part, point })
     };
     found.iter().enumerate().map(track).collect()
+}
+
+/// Checks that an index is among the `count`, and from `next` on, which becomes the one after it; otherwise says so.
+pub(super) fn in_rising_order(index: u32, next: &mut usize, count: usize, what: &str) -> Result<(), String> {
+    if !(*next..count).contains(&(index as usize)) {
+        return Err(format!("{what} {index} is not in rising order within the {count} {what}s"));
+    }
+    *next = index as usize + 1;
+    Ok(())
 }
 
 fn tracks_from_wire(tracks: proto::TrackResults) -> Result<TrackResults, Violation> {
@@ -379,11 +391,15 @@ fn two_view_track_to_wire(found: &TwoViewTrack) -> proto::TwoViewTrack {
 
 /// A point, or none at infinity.
 fn point_from_wire(numbers: &[f64], field: &'static str, index: usize) -> Result<Option<[f64; 3]>, Violation> {
-    match *numbers {
-        [] => Ok(None),
-        [x, y, z] => Ok(Some([x, y, z])),
-        _ => Err(Violation::at(field, index, format!("{} numbers instead of three", numbers.len()))),
+    if numbers.is_empty() {
+        return Ok(None);
     }
+    three(numbers).map(Some).map_err(|what| Violation::at(field, index, what))
+}
+
+/// Three numbers, or what is wrong with them.
+pub(super) fn three(numbers: &[f64]) -> Result<[f64; 3], String> {
+    numbers.try_into().map_err(|_| format!("{} numbers instead of three", numbers.len()))
 }
 
 fn observations_from_wire(mut observations: proto::ObservationResults) -> Result<ObservationResults, Violation> {

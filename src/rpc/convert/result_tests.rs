@@ -3,6 +3,7 @@
 use prost::Message;
 
 use super::*;
+use crate::domain::result::{SecondStructure, SecondStructureKind, StructurePoint, StructurePose};
 use crate::domain::{HeadProgress, LensProjection, Losses, Phase, Progress, ReconstructionProgress};
 
 fn name() -> JobName {
@@ -113,6 +114,29 @@ pub(super) fn rich() -> Solution {
             TwoViewTrack { track: 0, weight: 0.75, part: 1, point: Some([4.0, 5.0, 6.0]) },
             TwoViewTrack { track: 2, weight: 0.875, part: 0, point: None },
         ],
+        second_structures: vec![
+            SecondStructure { number: 1, kind: None, poses: Vec::new(), points: Vec::new() },
+            SecondStructure {
+                number: 2,
+                kind: Some(SecondStructureKind::RepeatedStructure),
+                poses: vec![
+                    StructurePose {
+                        view: 0,
+                        rotation: [[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]],
+                        translation: [0.5, -1.5, 2.5],
+                    },
+                    StructurePose {
+                        view: 5,
+                        rotation: [[0.0, 1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, 1.0]],
+                        translation: [1.0 / 3.0, 0.0, 0.0],
+                    },
+                ],
+                points: vec![
+                    StructurePoint { track: 0, point: [7.0, -8.0, 9.5] },
+                    StructurePoint { track: 2, point: [1e-9, 2.0, 3.0] },
+                ],
+            },
+        ],
         noise_px: Some(0.5),
         reprojection_rms_px: Some(0.7),
         reprojection_mean_px: Some(0.6),
@@ -159,6 +183,7 @@ fn a_solution_without_a_reconstruction_survives_too() {
         tracks: TrackResults::default(),
         observations: ObservationResults::default(),
         two_view_tracks: Vec::new(),
+        second_structures: Vec::new(),
         trained_network_sha256: None,
         noise_px: None,
         reprojection_rms_px: None,
@@ -195,6 +220,30 @@ fn a_malformed_answer_names_its_field() {
     assert_eq!(with(&|result| result.two_view_tracks[1].track_index = 3), two_view_track);
     assert_eq!(with(&|result| result.two_view_tracks[1].track_index = 0), two_view_track);
     assert_eq!(with(&|result| result.two_view_tracks[0].point.truncate(2)), "two_view_tracks.point[0]");
+    let structures = |result: &mut proto::JobResult, change: &dyn Fn(&mut proto::SecondStructure)| {
+        change(&mut result.second_structures[1]);
+    };
+    let number = "second_structures[1].number";
+    assert_eq!(with(&|result| result.second_structures[0].number = 0), "second_structures[0].number");
+    assert_eq!(with(&|result| structures(result, &|structure| structure.number = 1)), number);
+    assert_eq!(with(&|result| structures(result, &|structure| structure.number = 3)), number);
+    let view = "second_structures[1].poses[1].view_index";
+    assert_eq!(with(&|result| structures(result, &|structure| structure.poses[1].view_index = 6)), view);
+    assert_eq!(with(&|result| structures(result, &|structure| structure.poses[1].view_index = 0)), view);
+    let track = "second_structures[1].points[1].track_index";
+    assert_eq!(with(&|result| structures(result, &|structure| structure.points[1].track_index = 3)), track);
+    assert_eq!(with(&|result| structures(result, &|structure| structure.points[1].track_index = 0)), track);
+    for count in [0, 8] {
+        let rotation = with(&|result| structures(result, &|structure| structure.poses[0].rotation.truncate(count)));
+        assert_eq!(rotation, "second_structures[1].poses[0].rotation");
+    }
+    for count in [0, 2] {
+        let translation =
+            with(&|result| structures(result, &|structure| structure.poses[0].translation.truncate(count)));
+        assert_eq!(translation, "second_structures[1].poses[0].translation");
+        let point = with(&|result| structures(result, &|structure| structure.points[0].point.truncate(count)));
+        assert_eq!(point, "second_structures[1].points[0].point");
+    }
     assert_eq!(with(&|result| result.calibrations[0].grade = 9), "calibrations.grade");
     assert_eq!(with(&|result| result.calibrations[0].lens_projection = 9), "calibrations.lens_projection");
 }
@@ -214,6 +263,8 @@ fn what_only_a_later_version_knows_is_left_out() {
     expected.history.remove(0);
     result.views[3].left_out.as_mut().expect("set").reason = 99;
     expected.views[3].left_out = Some(LeftOut::Unknown);
+    result.second_structures[1].kind = 99;
+    expected.second_structures[1].kind = None;
     result.warnings[0].code = 99;
     expected.warnings[0].code = WarningCode::Unknown;
     assert_eq!(from_wire(result), Ok(expected.clone()));

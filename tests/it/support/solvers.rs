@@ -103,6 +103,7 @@ pub fn solution(input: &Input, settings: &SolveSettings) -> Solution {
         },
         splits: Vec::new(),
         two_view_tracks: Vec::new(),
+        second_structures: Vec::new(),
         noise_px: Some(0.5),
         reprojection_rms_px: Some(0.75),
         reprojection_mean_px: None,

@@ -69,6 +69,12 @@ class LeftOutReason(int, metaclass=_enum_type_wrapper.EnumTypeWrapper):
     LEFT_OUT_REASON_NO_OBSERVATIONS: _ClassVar[LeftOutReason]
     LEFT_OUT_REASON_OUTSIDE_BLOCK: _ClassVar[LeftOutReason]
     LEFT_OUT_REASON_NOT_REGISTERED: _ClassVar[LeftOutReason]
+
+class SecondStructureKind(int, metaclass=_enum_type_wrapper.EnumTypeWrapper):
+    __slots__ = ()
+    SECOND_STRUCTURE_KIND_UNSPECIFIED: _ClassVar[SecondStructureKind]
+    SECOND_STRUCTURE_KIND_MOVING_BODY: _ClassVar[SecondStructureKind]
+    SECOND_STRUCTURE_KIND_REPEATED_STRUCTURE: _ClassVar[SecondStructureKind]
 RESULT_STATUS_UNSPECIFIED: ResultStatus
 RESULT_STATUS_SOLVED: ResultStatus
 RESULT_STATUS_NO_RECONSTRUCTION: ResultStatus
@@ -111,6 +117,9 @@ LEFT_OUT_REASON_UNSPECIFIED: LeftOutReason
 LEFT_OUT_REASON_NO_OBSERVATIONS: LeftOutReason
 LEFT_OUT_REASON_OUTSIDE_BLOCK: LeftOutReason
 LEFT_OUT_REASON_NOT_REGISTERED: LeftOutReason
+SECOND_STRUCTURE_KIND_UNSPECIFIED: SecondStructureKind
+SECOND_STRUCTURE_KIND_MOVING_BODY: SecondStructureKind
+SECOND_STRUCTURE_KIND_REPEATED_STRUCTURE: SecondStructureKind
 
 class Warning(_message.Message):
     __slots__ = ("code", "detail", "camera_group")
@@ -264,6 +273,36 @@ class TwoViewTrack(_message.Message):
     point: _containers.RepeatedScalarFieldContainer[float]
     def __init__(self, track_index: _Optional[int] = ..., weight: _Optional[float] = ..., part: _Optional[int] = ..., point: _Optional[_Iterable[float]] = ...) -> None: ...
 
+class SecondStructure(_message.Message):
+    __slots__ = ("number", "kind", "poses", "points")
+    NUMBER_FIELD_NUMBER: _ClassVar[int]
+    KIND_FIELD_NUMBER: _ClassVar[int]
+    POSES_FIELD_NUMBER: _ClassVar[int]
+    POINTS_FIELD_NUMBER: _ClassVar[int]
+    number: int
+    kind: SecondStructureKind
+    poses: _containers.RepeatedCompositeFieldContainer[StructurePose]
+    points: _containers.RepeatedCompositeFieldContainer[StructurePoint]
+    def __init__(self, number: _Optional[int] = ..., kind: _Optional[_Union[SecondStructureKind, str]] = ..., poses: _Optional[_Iterable[_Union[StructurePose, _Mapping]]] = ..., points: _Optional[_Iterable[_Union[StructurePoint, _Mapping]]] = ...) -> None: ...
+
+class StructurePose(_message.Message):
+    __slots__ = ("view_index", "rotation", "translation")
+    VIEW_INDEX_FIELD_NUMBER: _ClassVar[int]
+    ROTATION_FIELD_NUMBER: _ClassVar[int]
+    TRANSLATION_FIELD_NUMBER: _ClassVar[int]
+    view_index: int
+    rotation: _containers.RepeatedScalarFieldContainer[float]
+    translation: _containers.RepeatedScalarFieldContainer[float]
+    def __init__(self, view_index: _Optional[int] = ..., rotation: _Optional[_Iterable[float]] = ..., translation: _Optional[_Iterable[float]] = ...) -> None: ...
+
+class StructurePoint(_message.Message):
+    __slots__ = ("track_index", "point")
+    TRACK_INDEX_FIELD_NUMBER: _ClassVar[int]
+    POINT_FIELD_NUMBER: _ClassVar[int]
+    track_index: int
+    point: _containers.RepeatedScalarFieldContainer[float]
+    def __init__(self, track_index: _Optional[int] = ..., point: _Optional[_Iterable[float]] = ...) -> None: ...
+
 class JoinedTracks(_message.Message):
     __slots__ = ("view_indices", "track_indices", "keypoint_indices", "match_count", "cut_match_count")
     VIEW_INDICES_FIELD_NUMBER: _ClassVar[int]
@@ -297,7 +336,7 @@ class ProposalDuration(_message.Message):
     def __init__(self, proposal: _Optional[_Union[Proposal, str]] = ..., duration: _Optional[_Union[_duration_pb2.Duration, _Mapping]] = ..., step_count: _Optional[int] = ...) -> None: ...
 
 class JobResult(_message.Message):
-    __slots__ = ("job", "server_version", "status", "grade", "method", "winning_proposal", "iteration_count", "seed", "calibrations", "plane_at_infinity", "views", "tracks", "observations", "track_splits", "noise_px", "reprojection_rms_px", "reprojection_mean_px", "warnings", "solve_duration", "stage_durations", "proposal_durations", "progress_records", "trained_network_sha256", "input_content_sha256", "joined_tracks", "two_view_tracks")
+    __slots__ = ("job", "server_version", "status", "grade", "method", "winning_proposal", "iteration_count", "seed", "calibrations", "plane_at_infinity", "views", "tracks", "observations", "track_splits", "noise_px", "reprojection_rms_px", "reprojection_mean_px", "warnings", "solve_duration", "stage_durations", "proposal_durations", "progress_records", "trained_network_sha256", "input_content_sha256", "joined_tracks", "two_view_tracks", "second_structures")
     JOB_FIELD_NUMBER: _ClassVar[int]
     SERVER_VERSION_FIELD_NUMBER: _ClassVar[int]
     STATUS_FIELD_NUMBER: _ClassVar[int]
@@ -324,6 +363,7 @@ class JobResult(_message.Message):
     INPUT_CONTENT_SHA256_FIELD_NUMBER: _ClassVar[int]
     JOINED_TRACKS_FIELD_NUMBER: _ClassVar[int]
     TWO_VIEW_TRACKS_FIELD_NUMBER: _ClassVar[int]
+    SECOND_STRUCTURES_FIELD_NUMBER: _ClassVar[int]
     job: str
     server_version: str
     status: ResultStatus
@@ -350,4 +390,5 @@ class JobResult(_message.Message):
     input_content_sha256: bytes
     joined_tracks: JoinedTracks
     two_view_tracks: _containers.RepeatedCompositeFieldContainer[TwoViewTrack]
-    def __init__(self, job: _Optional[str] = ..., server_version: _Optional[str] = ..., status: _Optional[_Union[ResultStatus, str]] = ..., grade: _Optional[_Union[Grade, str]] = ..., method: _Optional[_Union[_settings_pb2.Method, str]] = ..., winning_proposal: _Optional[_Union[Proposal, str]] = ..., iteration_count: _Optional[int] = ..., seed: _Optional[int] = ..., calibrations: _Optional[_Iterable[_Union[Calibration, _Mapping]]] = ..., plane_at_infinity: _Optional[_Union[PlaneAtInfinity, _Mapping]] = ..., views: _Optional[_Iterable[_Union[ViewResult, _Mapping]]] = ..., tracks: _Optional[_Union[TrackResults, _Mapping]] = ..., observations: _Optional[_Union[ObservationResults, _Mapping]] = ..., track_splits: _Optional[_Iterable[_Union[TrackSplit, _Mapping]]] = ..., noise_px: _Optional[float] = ..., reprojection_rms_px: _Optional[float] = ..., reprojection_mean_px: _Optional[float] = ..., warnings: _Optional[_Iterable[_Union[Warning, _Mapping]]] = ..., solve_duration: _Optional[_Union[_duration_pb2.Duration, _Mapping]] = ..., stage_durations: _Optional[_Iterable[_Union[StageDuration, _Mapping]]] = ..., proposal_durations: _Optional[_Iterable[_Union[ProposalDuration, _Mapping]]] = ..., progress_records: _Optional[_Iterable[_Union[_progress_pb2.Progress, _Mapping]]] = ..., trained_network_sha256: _Optional[bytes] = ..., input_content_sha256: _Optional[bytes] = ..., joined_tracks: _Optional[_Union[JoinedTracks, _Mapping]] = ..., two_view_tracks: _Optional[_Iterable[_Union[TwoViewTrack, _Mapping]]] = ...) -> None: ...
+    second_structures: _containers.RepeatedCompositeFieldContainer[SecondStructure]
+    def __init__(self, job: _Optional[str] = ..., server_version: _Optional[str] = ..., status: _Optional[_Union[ResultStatus, str]] = ..., grade: _Optional[_Union[Grade, str]] = ..., method: _Optional[_Union[_settings_pb2.Method, str]] = ..., winning_proposal: _Optional[_Union[Proposal, str]] = ..., iteration_count: _Optional[int] = ..., seed: _Optional[int] = ..., calibrations: _Optional[_Iterable[_Union[Calibration, _Mapping]]] = ..., plane_at_infinity: _Optional[_Union[PlaneAtInfinity, _Mapping]] = ..., views: _Optional[_Iterable[_Union[ViewResult, _Mapping]]] = ..., tracks: _Optional[_Union[TrackResults, _Mapping]] = ..., observations: _Optional[_Union[ObservationResults, _Mapping]] = ..., track_splits: _Optional[_Iterable[_Union[TrackSplit, _Mapping]]] = ..., noise_px: _Optional[float] = ..., reprojection_rms_px: _Optional[float] = ..., reprojection_mean_px: _Optional[float] = ..., warnings: _Optional[_Iterable[_Union[Warning, _Mapping]]] = ..., solve_duration: _Optional[_Union[_duration_pb2.Duration, _Mapping]] = ..., stage_durations: _Optional[_Iterable[_Union[StageDuration, _Mapping]]] = ..., proposal_durations: _Optional[_Iterable[_Union[ProposalDuration, _Mapping]]] = ..., progress_records: _Optional[_Iterable[_Union[_progress_pb2.Progress, _Mapping]]] = ..., trained_network_sha256: _Optional[bytes] = ..., input_content_sha256: _Optional[bytes] = ..., joined_tracks: _Optional[_Union[JoinedTracks, _Mapping]] = ..., two_view_tracks: _Optional[_Iterable[_Union[TwoViewTrack, _Mapping]]] = ..., second_structures: _Optional[_Iterable[_Union[SecondStructure, _Mapping]]] = ...) -> None: ...

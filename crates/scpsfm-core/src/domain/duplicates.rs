@@ -104,6 +104,9 @@ impl Duplicates {
         }
         repeat(&mut solution.splits, &of_first, |split| &mut split.track);
         repeat(&mut solution.two_view_tracks, &of_first, |found| &mut found.track);
+        for structure in &mut solution.second_structures {
+            repeat(&mut structure.points, &of_first, |point| &mut point.track);
+        }
     }
 }
 

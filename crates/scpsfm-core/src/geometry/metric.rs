@@ -4,11 +4,14 @@ use nalgebra::{Matrix3, Matrix4, Vector3, Vector4};
 
 use super::bundle::critical::Translating;
 use super::bundle::metric::{Intrinsics, MetricReconstruction, Pose};
-use super::daq::{self, CanonicalFrame, Daq};
+use super::daq::{self, CanonicalFrame, Daq, Free, to_canonical_frame};
 use super::observation::Observation;
 use super::procrustes::nearest_rotation;
 use super::statistics::median;
-use super::triangulation;
+use super::{Camera, Point, triangulation};
+
+/// Iterations in which a plane at infinity is refined: it converges in 10 to 20.
+const PLANE_ITERATIONS: usize = 40;
 
 /// Distance at which points are held, in median depths: beyond it the depth of a point moves no observation, while a
 /// point at infinity would have no coordinates.
@@ -59,6 +62,28 @@ pub fn upgrade(
     }
     reconstruction.average_focals();
     oriented(reconstruction, observations)
+}
+
+/// Upgrades a projective reconstruction of cameras whose intrinsics are known and undone, so that they image rays at
+/// unit depth: as [`upgrade`], with each of the planes at infinity of least residual, best first.
+///
+/// * `views`: how many of those with the widest baselines to the first the planes are taken from
+/// * `planes`: how many are refined
+///
+/// Empty where [`upgrade`] gives none, and where no view has a baseline to the first.
+pub fn upgrade_calibrated(
+    cameras: &[Camera],
+    points: &[Point],
+    observations: &[Observation],
+    views: usize,
+    planes: usize,
+) -> Vec<MetricReconstruction> {
+    let Some(frame) = to_canonical_frame(cameras, points) else { return Vec::new() };
+    let starts = daq::scan_planes(&frame.cameras, 1.0, views).into_iter().take(planes);
+    let mut refined: Vec<(Daq, f64)> =
+        starts.map(|(start, _)| daq::refine(&frame.cameras, start, Free::Plane, PLANE_ITERATIONS)).collect();
+    refined.sort_by(|a, b| a.1.total_cmp(&b.1));
+    refined.iter().filter_map(|(daq, _)| upgrade(&frame, daq, false, observations)).collect()
 }
 
 /// A camera that moved without turning as a metric reconstruction, were this its focal length: mirrored and scaled as
@@ -192,8 +217,7 @@ pub fn retriangulate(
 mod tests {
     use super::super::bundle::metric::{IntrinsicsModel, IntrinsicsPrior, adjust};
     use super::super::bundle::{Options, testing};
-    use super::super::daq::to_canonical_frame;
-    use super::super::daq::{Free, refine, scan};
+    use super::super::daq::{refine, scan};
     use super::*;
     use crate::domain::StopToken;
 
@@ -215,6 +239,26 @@ mod tests {
                 assert!(error < 1e-5, "seed {seed}: {error}");
             }
         }
+    }
+
+    #[test]
+    fn calibrated_cameras_are_upgraded_exactly() {
+        for seed in 0..5 {
+            let scene = testing::scene(seed, 8, 20, 0.0);
+            let (cameras, points) = testing::projectively_transformed(&scene, seed);
+            let to_rays = scene.intrinsics.matrix().try_inverse().expect("a focal length");
+            let cameras: Vec<Camera> = cameras.iter().map(|camera| to_rays * camera).collect();
+            let found = upgrade_calibrated(&cameras, &points, &scene.observations, 4, 3);
+            let upgraded = found.first().expect("metric");
+            assert_eq!(cheirality(upgraded, &scene.observations), 1.0, "seed {seed}");
+            for seen in &scene.observations {
+                let ray = scene.intrinsics.ray(&seen.xy).expect("in front");
+                let error = upgraded.residual(&Observation { xy: ray, ..*seen }).norm();
+                assert!(error < 1e-6, "seed {seed}: {error}");
+            }
+        }
+        // No baseline tells the plane.
+        assert!(upgrade_calibrated(&[Camera::identity(); 3], &[], &[], 4, 3).is_empty());
     }
 
     /// Far out, behind the cameras or not a number, behind a lens or not. What is at its minimum stays, and so does

@@ -12,11 +12,13 @@ use super::portfolio::Found;
 use super::problem::{Problem, camera_groups};
 use super::reconstruction::{Reconstruction, own_verdicts};
 use super::recorder::Recorder;
-use super::second_structures::{self, SecondStructure};
+use super::second_structures::{self, Structure};
 use super::sequence::Ended;
 use super::view_selection::{LEAST_SHARED_BY_PAIR, LEAST_VIEWS};
 use super::{Error, static_tracks};
-use crate::domain::result::{ObservationResults, Sigmas, TrackResults, TrackSplit, TwoViewTrack, ViewResult};
+use crate::domain::result::{
+    ObservationResults, SecondStructure, Sigmas, TrackResults, TrackSplit, TwoViewTrack, ViewResult,
+};
 use crate::domain::{Calibration, Grade, Solution, Stage, Status, Warning, WarningCode};
 use crate::geometry::bundle::metric::{Intrinsics, Parameter};
 use crate::geometry::daq::oriented;
@@ -40,19 +42,17 @@ pub fn solution(ended: Ended, problem: &Problem, mut recorder: Recorder) -> Resu
             return Ok(unsolved(problem, seed.as_deref(), warnings, recorder));
         }
     };
-    let second = match problem.is_searched() {
-        true => second_structures::find(problem, &first.reconstruction.geometry, &first.judged, first.evidence)?,
-        false => None,
-    };
-    let second = second.map(|SecondStructure { tracks, rival }| {
-        let rival = rival.and_then(|ended| Assembled::of(ended, problem, &mut recorder).ok());
-        match rival.filter(|rival| rival.may_replace(&first)) {
-            Some(rival) => std::mem::replace(&mut first, rival).judged.tracks.inlier,
-            None => tracks,
+    let mut structures = Vec::new();
+    if problem.is_searched() {
+        structures = first.second_structures(problem, &vec![false; problem.tracks()])?;
+        if let Some(rival) = first.rival(problem, &structures, &mut recorder)? {
+            let before = std::mem::replace(&mut first, rival).judged.tracks.inlier;
+            structures = first.second_structures(problem, &before)?;
+            structures.push(Structure::of_tracks(problem, &first.reconstruction.geometry, before)?);
         }
-    });
+    }
     let Assembled { reconstruction, seed, judged, .. } = first;
-    Ok(reconstruction.solution(problem, &seed, judged, second, warnings, recorder))
+    reconstruction.solution(problem, &seed, judged, structures, warnings, recorder)
 }
 
 /// A reconstruction and what it says of every track and observation.
@@ -96,6 +96,25 @@ impl Assembled {
         Ok(Self { reconstruction, seed: *seed, judged, evidence })
     }
 
+    /// As [`second_structures::find`].
+    fn second_structures(&self, problem: &Problem, known: &[bool]) -> Result<Vec<Structure>, Error> {
+        let Self { reconstruction, judged, evidence, .. } = self;
+        second_structures::find(problem, &reconstruction.geometry, judged, *evidence, known)
+    }
+
+    /// What is the result in its place, where one of its second structures is the scene.
+    fn rival(
+        &self,
+        problem: &Problem,
+        structures: &[Structure],
+        recorder: &mut Recorder,
+    ) -> Result<Option<Self>, Error> {
+        let Self { reconstruction, judged, evidence, .. } = self;
+        let rival = second_structures::rival(problem, &reconstruction.geometry, judged, *evidence, structures)?;
+        let rival = rival.and_then(|ended| Self::of(ended, problem, recorder).ok());
+        Ok(rival.filter(|rival| rival.may_replace(self)))
+    }
+
     /// Whether it may be the result in place of one that it explains more than: where it is verified, not of static
     /// tracks, and graded no worse. A calibration is of the camera, whatever moved before it.
     fn may_replace(&self, other: &Self) -> bool {
@@ -112,7 +131,7 @@ impl Reconstruction {
 
     /// Writes down what it and the judged tracks say.
     ///
-    /// * `second`: tracks of a second structure
+    /// * `structures`: other rigid motions
     ///
     /// With grade PROJECTIVE_ONLY nothing metric is in it, the focal length included: a number that must not be used
     /// is not given; points are then in the frame of the projective cameras.
@@ -121,19 +140,24 @@ impl Reconstruction {
         problem: &Problem,
         seed: &Attempt,
         mut judged: Judged,
-        second: Option<Vec<bool>>,
+        structures: Vec<Structure>,
         mut warnings: Vec<Warning>,
         recorder: Recorder,
-    ) -> Solution {
+    ) -> Result<Solution, Error> {
         warnings.extend(self.warnings.iter().cloned());
         let inliers = judged.tracks.inlier.iter().filter(|&&inlier| inlier).count();
         let least = seed.least_inliers();
         if inliers < least {
             let detail = format!("{inliers} tracks hold under the final geometry; {least} can be verified");
             warnings.push(Warning::new(WarningCode::FewInliers, detail));
-            return nothing(problem, Some(seed), warnings, recorder);
+            return Ok(nothing(problem, Some(seed), warnings, recorder));
         }
-        warnings.extend(second.and_then(|second| second_structures::mark(problem, &second, &mut judged.tracks)));
+        let structures = second_structures::verified(problem, structures, &judged.tracks.inlier);
+        warnings.extend(second_structures::mark(&structures, &mut judged.tracks));
+        let second_structures: Vec<SecondStructure> = (1..)
+            .zip(&structures)
+            .map(|(number, structure)| second_structures::describe(problem, &self, structure, number))
+            .collect::<Result<_, _>>()?;
         warnings.extend(static_tracks::warning(problem, &judged.tracks.inlier));
         let frames = self.frames(problem);
         let backs: Vec<Option<Matrix4<f64>>> =
@@ -173,7 +197,7 @@ impl Reconstruction {
         judged.tracks.point = points;
         judged.tracks.network_weight = network_weights(problem, seed);
         let (rms, mean) = reprojection(&judged.observations);
-        Solution {
+        Ok(Solution {
             status: Status::Solved,
             grade: Some(self.grade),
             winning_proposal: seed.found.winning_proposal,
@@ -185,11 +209,12 @@ impl Reconstruction {
             observations: judged.observations,
             splits,
             two_view_tracks,
+            second_structures,
             noise_px: Some(self.geometry.noise * problem.scale_px),
             reprojection_rms_px: rms,
             reprojection_mean_px: mean,
             ..nothing(problem, Some(seed), warnings, recorder)
-        }
+        })
     }
 
     /// The calibration of each camera group with registered views in pixels, its principal point about the image centre
@@ -328,6 +353,7 @@ fn nothing(problem: &Problem, attempt: Option<&Attempt>, warnings: Vec<Warning>,
         observations: ObservationResults::unjudged(problem.input.observation_count()),
         splits: Vec::new(),
         two_view_tracks: Vec::new(),
+        second_structures: Vec::new(),
         noise_px: None,
         reprojection_rms_px: None,
         reprojection_mean_px: None,

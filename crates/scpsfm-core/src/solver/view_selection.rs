@@ -230,7 +230,7 @@ fn greedy_views(problem: &Problem, open: &[bool], least: usize) -> Vec<Vec<usize
 }
 
 /// At most `most` of the items, evenly spread.
-pub fn evenly(items: &[usize], most: usize) -> Vec<usize> {
+pub fn evenly<T: Copy>(items: &[T], most: usize) -> Vec<T> {
     let count = items.len().min(most);
     (0..count).map(|k| items[k * items.len() / count]).collect()
 }

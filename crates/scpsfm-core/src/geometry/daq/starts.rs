@@ -137,17 +137,28 @@ pub fn scan_focal(step: usize, focals: usize) -> f64 {
 /// Tries `focals` focal lengths, each with the planes at infinity that the `views` views with the widest baseline to
 /// the first give in closed form. Returns them with their residual, best first.
 pub fn scan(cameras: &[Matrix3x4<f64>], focals: usize, views: usize) -> Vec<(Daq, f64)> {
+    let focals = (0..focals).map(|step| scan_focal(step, focals));
     ranked(scanned(cameras, focals, views, &[1.0]), |daq| residual(cameras, daq))
+}
+
+/// The same of one focal length, which is known.
+pub fn scan_planes(cameras: &[Matrix3x4<f64>], focal: f64, views: usize) -> Vec<(Daq, f64)> {
+    ranked(scanned(cameras, [focal], views, &[1.0]), |daq| residual(cameras, daq))
 }
 
 /// The quadrics of a scan.
 ///
 /// * `ratios`: of the focal length of the other view to that of the first
-pub(super) fn scanned(cameras: &[Matrix3x4<f64>], focals: usize, views: usize, ratios: &[f64]) -> Vec<Daq> {
+pub(super) fn scanned(
+    cameras: &[Matrix3x4<f64>],
+    focals: impl IntoIterator<Item = f64>,
+    views: usize,
+    ratios: &[f64],
+) -> Vec<Daq> {
     let mut widest: Vec<&Matrix3x4<f64>> = cameras.iter().skip(1).collect();
     widest.sort_by(|a, b| b.column(3).norm().total_cmp(&a.column(3).norm()));
     let mut found = Vec::new();
-    for focal in (0..focals).map(|step| scan_focal(step, focals)) {
+    for focal in focals {
         for camera in widest.iter().take(views) {
             let planes = ratios.iter().filter_map(|ratio| plane_from_focals(camera, focal, ratio * focal)).flatten();
             let finite = planes.filter(|plane| plane.iter().all(|value| value.is_finite()));

@@ -32,8 +32,9 @@ use std::ops::ControlFlow;
 
 pub use adjust::verified;
 pub use extended::Extended;
+pub use options::ExtensionOptions;
 pub use projective::ProjectiveReconstruction;
-pub use structure::component_of_track;
+pub use structure::{component_of_track, widest_angle};
 
 use super::attempt::{self, Attempt, Effort};
 use super::block::Block;
@@ -46,7 +47,7 @@ use super::view_selection::{SeedViews, ViewSelectionOptions};
 use super::{Error, near_duplicates, view_selection};
 use crate::domain::Stage;
 use extended::extend;
-use options::{ExtensionOptions, GrowthOptions};
+use options::GrowthOptions;
 
 /// How subsets are searched, of which many are tried.
 const QUICK_SEED: Effort = Effort { is_seed: true, is_quick: true };

@@ -118,7 +118,7 @@ fn euclidean(point: &Point) -> Option<Vector3<f64>> {
 
 /// About the largest angle between two of the unit rays, never more: that between the one farthest from their mean and
 /// the one farthest from that, so that long tracks cost no more than short ones.
-fn widest_angle(rays: &[Vector3<f64>]) -> f64 {
+pub fn widest_angle(rays: &[Vector3<f64>]) -> f64 {
     let farthest = |from: &Vector3<f64>| rays.iter().min_by(|a, b| a.dot(from).total_cmp(&b.dot(from)));
     let mean: Vector3<f64> = rays.iter().sum();
     let ends = farthest(&mean).and_then(|end| Some((end, farthest(end)?)));

@@ -1,0 +1,326 @@
+//! Whether the tracks that a reconstruction leaves out agree on motions of their own, and on which ([`motion`]).
+//!
+//! Only `assemble` depends on this; it solves parts of the input as the rest of the solver does.
+
+mod motion;
+
+use std::cmp::Reverse;
+
+pub use motion::describe;
+
+use super::Error;
+use super::block::Block;
+use super::classification::{Geometry, Judged};
+use super::grow::{self, LEAST_INLIERS, LEAST_SUPPORT};
+use super::priors;
+use super::problem::{Problem, Undone, VERIFIED};
+use super::recorder::Recorder;
+use super::search::affine::AffineSearch;
+use super::sequence::{self, Ended, ExtensionOptions, ProjectiveReconstruction};
+use super::view_selection::ViewSelectionOptions;
+use crate::domain::result::TrackResults;
+use crate::domain::{Method, Silent, SolveSettings, StopToken, Warning, WarningCode};
+
+options! {
+    /// What counts as a second structure, and what is said of its motion.
+    pub struct SecondStructureOptions {
+        /// Searches at most, each among the tracks that are left; so many structures are reported at most. Most inputs
+        /// have none, and then the first is the last.
+        most_searches: usize = 4,
+        /// Gates from which a track counts as left out: nearer ones are of the reconstruction, with an outlier's share
+        /// of noise.
+        far_gates: f64 = 16.0,
+        /// Evidence, at least, as a share of that of the reconstruction. Of 280 photographed scenes, drifting tracks of
+        /// four had .01 to .03 in a few views; of 31 second bodies 27 had .07 and more, one .01, and three none.
+        least_share: f64 = 0.05,
+        /// Tracks of a block from which it is searched only where more than four of them fit affine cameras. In smaller
+        /// blocks perspective hides that, and their search takes 10 to 20 ms; that of 190 wrong tracks took five times
+        /// as long as the rest of an easy solve.
+        affine_check_tracks: usize = ViewSelectionOptions::DEFAULT.wanted_tracks,
+        /// Triplets that are searched. Of wrong matches each takes a tenth of a second.
+        most_triplets: usize = 2,
+        /// Views that the plane at infinity of a structure is taken from, and planes that are refined and compared: as
+        /// many views as of the scan of a calibration; a body that is nearly a plane has two planes, and one is to spare.
+        plane_views: usize = 4,
+        planes: usize = 3,
+        /// Iterations of its poses and points under the calibration: those of an algebraic solution.
+        iterations: usize = 30,
+        /// Angle between the rays of its points, in the median, from which its poses are determined, radians: as that
+        /// from which the depth of a point supports a pose. Below, it has only turned before the camera.
+        least_angle: f64 = ExtensionOptions::DEFAULT.least_angle,
+        /// Difference in the rotation of a view against the first, radians, from which another reconstruction that fits
+        /// about as well has other poses. One minimum is reached to a millionth.
+        other_poses: f64 = 0.02,
+        /// Points by which it is compared with the scene, evenly chosen, and pairs of views that the ratio of the two
+        /// scales is taken from. A median of 20 is known to a quarter of their spread; of five copies a fifth of the
+        /// pairs is of one.
+        compared_points: usize = 20,
+        compared_scales: usize = 30,
+        /// Share of all pairs of its views between which it must rest against the scene to count as a repeated
+        /// structure. Of `k` copies, each in as many views, it rests between one pair in `k`; a body that moves rests
+        /// between views that follow each other.
+        least_resting: f64 = 0.2,
+    }
+}
+
+const OPTIONS: SecondStructureOptions = SecondStructureOptions::DEFAULT;
+/// The component with most views.
+const LARGEST: u32 = 0;
+
+/// Tracks that agree on another rigid motion.
+pub struct Structure {
+    /// Whether each track of the input does.
+    pub tracks: Vec<bool>,
+    /// What they make, up to a projective transform; `None` where nothing came of it.
+    reconstruction: Option<ProjectiveReconstruction>,
+}
+
+impl Structure {
+    /// That of these tracks, in the views of another reconstruction.
+    ///
+    /// # Errors
+    /// [`Error::Stopped`]; [`Error::Internal`] for defects.
+    pub fn of_tracks(problem: &Problem, geometry: &Geometry, tracks: Vec<bool>) -> Result<Self, Error> {
+        let reconstruction = reconstructed(problem, geometry, &tracks, |_| true)?.map(|(found, _)| found);
+        Ok(Self { tracks, reconstruction })
+    }
+
+    /// As [`ProjectiveReconstruction::evidence`].
+    fn evidence(&self, problem: &Problem) -> f64 {
+        self.reconstruction.as_ref().map_or(0.0, |found| found.evidence(problem.outlier_density))
+    }
+}
+
+/// Searches the tracks that a reconstruction leaves out, in its views, for other rigid motions, one after the other:
+/// the next among the tracks of none before.
+///
+/// * `evidence`: that of the reconstruction
+/// * `known`: tracks that are not searched
+///
+/// # Errors
+/// [`Error::Stopped`]; [`Error::Internal`] for defects.
+pub fn find(
+    problem: &Problem,
+    geometry: &Geometry,
+    judged: &Judged,
+    evidence: f64,
+    known: &[bool],
+) -> Result<Vec<Structure>, Error> {
+    let mut is_left = far_from(problem, geometry, judged);
+    let leave_out = |is_left: &mut [bool], tracks: &[bool]| {
+        is_left.iter_mut().zip(tracks).for_each(|(is_left, is_known)| *is_left &= !is_known);
+    };
+    leave_out(&mut is_left, known);
+    let mut found = Vec::new();
+    for _ in 0..OPTIONS.most_searches {
+        let Some(next) = searched(problem, geometry, &is_left)? else { break };
+        leave_out(&mut is_left, &next.tracks);
+        // A weak one may have been found before a strong one.
+        if next.evidence(problem) >= OPTIONS.least_share * evidence {
+            found.push(next);
+        }
+    }
+    Ok(found)
+}
+
+/// What the input leads to without the inliers of a reconstruction, where one of its second structures explains more of
+/// it, and so does this: then that may be the scene, and the reconstruction a second structure.
+///
+/// * `evidence`: that of the reconstruction
+///
+/// # Errors
+/// As [`find`].
+pub fn rival(
+    problem: &Problem,
+    geometry: &Geometry,
+    judged: &Judged,
+    evidence: f64,
+    structures: &[Structure],
+) -> Result<Option<Ended>, Error> {
+    // What stands still in the image is no scene where something else moves, however many tracks it has.
+    let explains_more = |other: f64| geometry.of_static || other > evidence;
+    if !structures.iter().any(|structure| explains_more(structure.evidence(problem))) {
+        return Ok(None);
+    }
+    let rival = solved_without(problem, &judged.tracks.inlier)?;
+    Ok(Some(rival).filter(|rival| explains_more(rival.evidence(problem))))
+}
+
+/// Those of some tracks that make another projective reconstruction.
+fn searched(problem: &Problem, geometry: &Geometry, is_left: &[bool]) -> Result<Option<Structure>, Error> {
+    if is_left.iter().filter(|is_left| **is_left).count() < LEAST_INLIERS {
+        return Ok(None);
+    }
+    let passes = |block: &Block| passes_affine_check(block, problem.stop);
+    let Some((found, representative)) = reconstructed(problem, geometry, is_left, passes)? else { return Ok(None) };
+    let agrees = |track: usize| found.tracks.binary_search(&representative[problem.representative[track]]).is_ok();
+    let structure =
+        Structure { tracks: (0..problem.tracks()).map(agrees).collect(), reconstruction: Some(found.clone()) };
+    let stands = found.tracks.len() >= LEAST_INLIERS && structure.evidence(problem) > 0.0;
+    Ok(stands.then_some(structure))
+}
+
+/// A projective reconstruction of some tracks in the registered views of the largest component, behind the lenses of
+/// these, with the track that represents each; near-duplicates take no part.
+///
+/// * `is_promising`: which blocks are worth a search
+fn reconstructed(
+    problem: &Problem,
+    geometry: &Geometry,
+    tracks: &[bool],
+    is_promising: impl Fn(&Block) -> bool,
+) -> Result<Option<(ProjectiveReconstruction, Vec<usize>)>, Error> {
+    let is_registered = |view: usize| geometry.cameras[view].is_some() && geometry.component_of_view[view] == LARGEST;
+    let takes_part = |track: usize| tracks[track] && !problem.is_near_duplicate(track);
+    let input = problem.input.restricted_to(|k| takes_part(problem.track_of(k)) && is_registered(problem.view_of(k)));
+    // One detector found all tracks, so that the noise is known.
+    let noise_px = Some(geometry.noise * problem.scale_px);
+    let settings = SolveSettings { method: Method::Geometry, noise_px, ..problem.settings.clone() };
+    let mut some = problem.of_some(&input, &settings);
+    some.undone = lenses(problem, geometry, &some);
+    let views = some.observed_views().len();
+    let triplets = OPTIONS.most_triplets;
+    let found = sequence::reconstruct_quickly(&some, is_promising, triplets, &mut Recorder::new(&mut Silent, views))?;
+    Ok(found.map(|found| (found, some.representative)))
+}
+
+/// Whether a block is small, or more of its tracks fit affine cameras than determine projective ones. Any four tracks
+/// fit some, and of wrong ones no fifth does (a test counts them).
+fn passes_affine_check(block: &Block, stop: &StopToken) -> bool {
+    let fits = || priors::affine_irls(AffineSearch::new(&block.complete).centred(), LEAST_SUPPORT, stop).is_some();
+    block.tracks.len() < OPTIONS.affine_check_tracks || fits()
+}
+
+/// The input without these tracks, solved.
+fn solved_without(problem: &Problem, tracks: &[bool]) -> Result<Ended, Error> {
+    let input = problem.input.restricted_to(|k| !tracks[problem.track_of(k)]);
+    let mut rest = problem.of_some(&input, problem.settings);
+    let views = rest.observed_views().len();
+    let mut ended = sequence::solve(&mut rest, &mut Recorder::new(&mut Silent, views))?;
+    if let Ended::Block(Some(attempt)) = &mut ended {
+        // All tracks are to be judged, not those of the rest alone.
+        attempt.judged = None;
+    }
+    Ok(ended)
+}
+
+/// Those of some structures that enough tracks verify, most tracks first: inliers are of none, nor are static tracks,
+/// which another warning reports.
+pub fn verified(problem: &Problem, mut structures: Vec<Structure>, inlier: &[bool]) -> Vec<Structure> {
+    let count = |structure: &Structure| structure.tracks.iter().filter(|is_of| **is_of).count();
+    for structure in &mut structures {
+        for (track, is_of) in structure.tracks.iter_mut().enumerate() {
+            *is_of &= !inlier[track] && !problem.is_static[track];
+        }
+    }
+    structures.retain(|structure| count(structure) >= LEAST_INLIERS);
+    structures.sort_by_key(|structure| Reverse(count(structure)));
+    structures
+}
+
+/// Marks the tracks of these structures by their numbers, from 1, and says so; `None` where there is none.
+pub fn mark(structures: &[Structure], tracks: &mut TrackResults) -> Option<Warning> {
+    if structures.is_empty() {
+        return None;
+    }
+    tracks.second_structure = vec![0; tracks.inlier.len()];
+    let mut counts = Vec::new();
+    for (number, structure) in (1..).zip(structures) {
+        let of_structure = tracks.second_structure.iter_mut().zip(&structure.tracks).filter(|(_, is_of)| **is_of);
+        counts.push(of_structure.map(|(slot, _)| *slot = number).count().to_string());
+    }
+    let inliers = tracks.inlier.iter().filter(|inlier| **inlier).count();
+    let detail = match counts.as_slice() {
+        [most @ .., last] if !most.is_empty() => format!(
+            "{} and {last} tracks that are left out agree on rigid motions of their own: moving bodies, or repeated \
+             structures; the result is of {inliers} other tracks, not of all",
+            most.join(", ")
+        ),
+        _ => format!(
+            "{} tracks that are left out agree on another rigid motion: a second moving body, or a repeated structure; \
+             the result is of {inliers} other tracks, not of both",
+            counts.concat()
+        ),
+    };
+    Some(Warning::new(WarningCode::SecondStructure, detail))
+}
+
+/// Whether each track is far from the largest component of the reconstruction, of those that a search may go by. What
+/// is far from another component may be of the largest.
+fn far_from(problem: &Problem, geometry: &Geometry, judged: &Judged) -> Vec<bool> {
+    let squared = |k: usize| {
+        let residual_px = judged.observations.residual_px[problem.input.caller_index(k)];
+        let squared = residual_px.map_or(f64::INFINITY, |residual_px| (residual_px / problem.scale_px).powi(2));
+        geometry.given_weight(problem, k) * squared
+    };
+    let is_far = |track: usize| {
+        let seen = geometry.of_track(problem, track);
+        let gate = OPTIONS.far_gates * grow::gate(seen.len()) * geometry.noise.powi(2);
+        seen.len() >= VERIFIED && seen.iter().map(|&k| squared(k)).sum::<f64>() > gate
+    };
+    let is_asked = |track: usize| {
+        let is_of_largest = geometry.component_of_track[track] == LARGEST;
+        is_of_largest && !judged.tracks.inlier[track] && problem.supports_growth(track, false)
+    };
+    (0..problem.tracks()).map(|track| is_asked(track) && is_far(track)).collect()
+}
+
+/// The lenses of a reconstruction, to be undone before others are looked for.
+fn lenses(problem: &Problem, geometry: &Geometry, rest: &Problem) -> Option<Undone> {
+    let lens = |camera: usize| {
+        let is_of = |view: &usize| problem.camera_of[*view] == camera && geometry.cameras[*view].is_some();
+        let view = (0..problem.views()).find(is_of)?;
+        Some((camera, *geometry.lenses.get(view)?))
+    };
+    Undone::new(rest, None, (0..problem.cameras).filter_map(lens))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::domain::{Input, Limits};
+    use crate::geometry::measurement::CompleteBlock;
+    use crate::solver::block;
+    use crate::synthetic::{Motion, Scene, SceneOptions};
+
+    /// The tracks of a scene that are not of its first motion.
+    fn left_out(options: &SceneOptions) -> CompleteBlock {
+        let scene = Scene::generate(options).expect("valid options");
+        let input = Input::new(scene.input, &Limits::default(), "scene").expect("a valid scene");
+        let whole = block::of_all_views(&input);
+        let wrong = |place: &usize| !scene.truth.inlier[whole.tracks[*place]];
+        whole.complete.select(&(0..whole.tracks.len()).filter(wrong).collect::<Vec<_>>())
+    }
+
+    #[test]
+    fn a_second_motion_has_more_tracks_that_agree_than_wrong_tracks_have_by_chance() {
+        let base = SceneOptions { outliers: 0.6, ..SceneOptions::default() };
+        let turned = SceneOptions { max_rotation_rad: 3.1, ..base.clone() };
+        let kinds = [
+            ("as it comes", base.clone()),
+            ("20 views", SceneOptions { views: 20, ..base.clone() }),
+            ("noisy", SceneOptions { noise: 0.01, ..base }),
+            ("turned", turned.clone()),
+            ("orbit", SceneOptions { motion: Motion::Orbit, ..turned }),
+        ];
+        for (kind, options) in kinds {
+            for seed in 30_000..30_008 {
+                let count = |second_motion: f64| {
+                    let rest = left_out(&SceneOptions { second_motion, seed, ..options.clone() });
+                    let ranking = priors::affine_irls(AffineSearch::new(&rest).centred(), 0, &StopToken::default());
+                    let count = priors::agreeing(&ranking.expect("finite points"));
+                    let held = priors::affine_irls(
+                        AffineSearch::new(&rest).centred(),
+                        grow::LEAST_SUPPORT,
+                        &StopToken::default(),
+                    );
+                    assert_eq!(held.is_some(), count >= grow::LEAST_SUPPORT, "{kind}, seed {seed}: {count}");
+                    count
+                };
+                let (chance, moved) = (count(0.0), count(0.3));
+                assert!(chance <= 4, "{kind}, seed {seed}: {chance} agree by chance");
+                assert!(moved >= 2 * grow::LEAST_SUPPORT, "{kind}, seed {seed}: {moved} of a second motion agree");
+            }
+        }
+    }
+}

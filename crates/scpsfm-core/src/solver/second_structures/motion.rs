@@ -1,0 +1,192 @@
+//! How a second structure moves: against the camera, whose calibration is known, and against the scene.
+
+use nalgebra::Vector3;
+
+use super::{OPTIONS, Structure};
+use crate::domain::Grade;
+use crate::domain::result::{SecondStructure, SecondStructureKind, StructurePoint, StructurePose};
+use crate::geometry::Camera;
+use crate::geometry::bundle::Options;
+use crate::geometry::bundle::metric::{self, Intrinsics, IntrinsicsModel, IntrinsicsPrior, MetricReconstruction, Pose};
+use crate::geometry::metric::{cheirality, upgrade_calibrated};
+use crate::geometry::observation::Observation;
+use crate::geometry::statistics::{CHI_SQUARE_OF_TWO, median};
+use crate::solver::Error;
+use crate::solver::classification::Geometry;
+use crate::solver::problem::Problem;
+use crate::solver::reconstruction::Reconstruction;
+use crate::solver::sequence::{ProjectiveReconstruction, widest_angle};
+use crate::solver::view_selection::{LEAST_VIEWS, evenly};
+
+/// Views that must see a point for it to be reported, as of a point of the scene.
+const LEAST_OBSERVATIONS: usize = 2;
+
+/// What is said of a structure: nothing of its motion without a metric reconstruction of the scene, nor where its
+/// tracks make none under the calibration of that.
+///
+/// # Errors
+/// [`Error::Stopped`].
+pub fn describe(
+    problem: &Problem,
+    reconstruction: &Reconstruction,
+    structure: &Structure,
+    number: u32,
+) -> Result<SecondStructure, Error> {
+    let unknown = SecondStructure { number, kind: None, poses: Vec::new(), points: Vec::new() };
+    let Some(found) = structure.reconstruction.as_ref().filter(|_| reconstruction.grade != Grade::ProjectiveOnly)
+    else {
+        return Ok(unknown);
+    };
+    let Some((metric, observations)) = calibrated(problem, &reconstruction.geometry, found)? else {
+        return Ok(unknown);
+    };
+    let scene: Vec<Option<Pose>> = found.views.iter().map(|&view| reconstruction.poses[view]).collect();
+    let mut seen = vec![0; metric.points.len()];
+    observations.iter().filter(|at| scene[at.view].is_some()).for_each(|at| seen[at.point] += 1);
+    let pose = |(k, pose): (usize, &Pose)| {
+        scene[k]?;
+        Some(StructurePose {
+            view: found.views[k] as u32,
+            rotation: std::array::from_fn(|row| std::array::from_fn(|column| pose.rotation[(row, column)])),
+            translation: pose.translation.into(),
+        })
+    };
+    let point = |(k, point): (usize, &Vector3<f64>)| {
+        let is_reported = structure.tracks[found.tracks[k]] && seen[k] >= LEAST_OBSERVATIONS;
+        is_reported.then(|| StructurePoint { track: found.tracks[k] as u32, point: (*point).into() })
+    };
+    Ok(SecondStructure {
+        number,
+        kind: kind(&scene, &metric, reconstruction.geometry.noise),
+        poses: metric.poses.iter().enumerate().filter_map(pose).collect(),
+        points: metric.points.iter().enumerate().filter_map(point).collect(),
+    })
+}
+
+/// The metric reconstruction of a structure under the calibration of the scene, in a frame and at a scale of its own,
+/// with its observations in the image; `None` where there is none that fits, is in front of its cameras, has parallax
+/// and is the only one.
+fn calibrated(
+    problem: &Problem,
+    geometry: &Geometry,
+    found: &ProjectiveReconstruction,
+) -> Result<Option<(MetricReconstruction, Vec<Observation>)>, Error> {
+    let lenses: Vec<Intrinsics> = found.views.iter().map(|&view| geometry.lenses[view]).collect();
+    let of_rays = |(camera, lens): (&Camera, &Intrinsics)| Some(lens.pinhole().matrix().try_inverse()? * camera);
+    let cameras: Option<Vec<Camera>> = found.cameras.iter().zip(&lenses).map(of_rays).collect();
+    let Some(cameras) = cameras else { return Ok(None) };
+    let in_image = |seen: &Observation| {
+        let k = problem.seen_in(found.tracks[seen.point], found.views[seen.view])?;
+        Some(Observation { xy: problem.xy[k], weight: geometry.given_weight(problem, k), ..*seen })
+    };
+    let observations: Vec<Observation> = found.observations.iter().filter_map(in_image).collect();
+    let (model, priors) = (IntrinsicsModel::FIXED, vec![IntrinsicsPrior::NONE; lenses.len()]);
+    let adjusted = |upgraded: MetricReconstruction| {
+        // Every view has the lens that it has in the scene.
+        let mut metric =
+            MetricReconstruction { intrinsics: lenses.clone(), group_of: (0..lenses.len()).collect(), ..upgraded };
+        let options = Options::squared(OPTIONS.iterations);
+        let report = metric::adjust(&mut metric, &observations, model, &priors, &options, problem.stop);
+        (metric, report.cost)
+    };
+    let upgraded =
+        upgrade_calibrated(&cameras, &found.points, &found.observations, OPTIONS.plane_views, OPTIONS.planes);
+    let mut minima: Vec<(MetricReconstruction, f64)> = upgraded.into_iter().map(adjusted).collect();
+    problem.stopped()?;
+    minima.retain(|(_, cost)| cost.is_finite());
+    minima.sort_by(|a, b| a.1.total_cmp(&b.1));
+    let Some((best, others)) = minima.split_first() else { return Ok(None) };
+    let (metric, cost) = best;
+    let options = &problem.calibration_options;
+    let freedom = (2 * observations.len()).saturating_sub(metric.unknowns(metric.points.len(), 0));
+    let (noise, of_scene) = (options.fit.posterior_noise(*cost, freedom), geometry.noise.max(options.fit.least_noise));
+    let is_rival = |(other, other_cost): &(MetricReconstruction, f64)| {
+        other_cost - cost < options.grades.indistinguishable * noise.max(of_scene).powi(2)
+            && turned_apart(metric, other) > OPTIONS.other_poses
+    };
+    let stands = noise <= options.fit.rms_ratio_refusal * of_scene
+        && cheirality(metric, &observations) >= options.grades.least_in_front
+        && median(&mut ray_angles(metric, &observations)) >= OPTIONS.least_angle
+        && !others.iter().any(is_rival);
+    Ok(stands.then(|| (metric.clone(), observations)))
+}
+
+/// The largest difference between the rotations of a view against the first in two reconstructions, radians.
+fn turned_apart(one: &MetricReconstruction, other: &MetricReconstruction) -> f64 {
+    let against_first =
+        |metric: &MetricReconstruction, view: usize| metric.poses[view].rotation * metric.poses[0].rotation.transpose();
+    let apart = |view: usize| {
+        let turn = against_first(one, view) * against_first(other, view).transpose();
+        // The chord of an angle on the unit circle, of a rotation matrix sqrt 8 sin(angle / 2).
+        2.0 * ((turn - nalgebra::Matrix3::identity()).norm() / 8.0f64.sqrt()).min(1.0).asin()
+    };
+    (0..one.poses.len()).map(apart).fold(0.0, f64::max)
+}
+
+/// For each observed point the widest angle between its rays, radians.
+fn ray_angles(metric: &MetricReconstruction, observations: &[Observation]) -> Vec<f64> {
+    let mut rays: Vec<Vec<Vector3<f64>>> = vec![Vec::new(); metric.points.len()];
+    for seen in observations {
+        let pose = &metric.poses[seen.view];
+        rays[seen.point].push(pose.rotation.tr_mul(&pose.apply(&metric.points[seen.point])).normalize());
+    }
+    rays.iter().filter(|rays| !rays.is_empty()).map(|rays| widest_angle(rays)).collect()
+}
+
+/// Whether a structure rests against the scene between many views, at the ratio of the two scales at which it rests
+/// between most; `None` where too few views have both poses.
+///
+/// * `scene`: the pose of each of its views in the scene
+/// * `metric`: the structure, of these views
+/// * `noise`: one standard deviation of a coordinate
+fn kind(scene: &[Option<Pose>], metric: &MetricReconstruction, noise: f64) -> Option<SecondStructureKind> {
+    let views: Vec<(Pose, Pose, f64)> = scene
+        .iter()
+        .enumerate()
+        .filter_map(|(k, scene)| Some(((*scene)?, metric.poses[k], metric.intrinsics_of(k).focal)))
+        .collect();
+    if views.len() < LEAST_VIEWS {
+        return None;
+    }
+    let points = evenly(&metric.points, OPTIONS.compared_points);
+    let pairs: Vec<(usize, usize)> = (0..views.len()).flat_map(|j| (0..j).map(move |i| (i, j))).collect();
+    let ratio = |(i, j): (usize, usize)| ratio_of_scales(&views[i], &views[j]);
+    let scales = evenly(&pairs, OPTIONS.compared_scales).into_iter().map(ratio).filter(|ratio| *ratio > 0.0);
+    let resting =
+        |ratio: f64| pairs.iter().filter(|(i, j)| rests(&views[*i], &views[*j], ratio, &points, noise)).count();
+    // Without one the camera only turned, and no scale matters.
+    let most = scales.chain([1.0]).map(resting).max().unwrap_or(0);
+    Some(match most as f64 >= OPTIONS.least_resting * pairs.len() as f64 {
+        true => SecondStructureKind::RepeatedStructure,
+        false => SecondStructureKind::MovingBody,
+    })
+}
+
+/// The scale of a structure in that of the scene at which its frame moves least between two views.
+///
+/// At a ratio `s` the frame of the structure is in the scene at `R' (s tₛ - t)`.
+fn ratio_of_scales((scene_i, own_i, _): &(Pose, Pose, f64), (scene_j, own_j, _): &(Pose, Pose, f64)) -> f64 {
+    let own = |scene: &Pose, own: &Pose| scene.rotation.tr_mul(&own.translation);
+    let centre = |scene: &Pose| -scene.rotation.tr_mul(&scene.translation);
+    let moved = own(scene_i, own_i) - own(scene_j, own_j);
+    let moved_camera = centre(scene_i) - centre(scene_j);
+    -moved.dot(&moved_camera) / moved.norm_squared()
+}
+
+/// Whether most points of a structure, were they to rest in the scene where they are in the first view, would be imaged
+/// in the second as they are.
+fn rests(
+    (scene_i, own_i, _): &(Pose, Pose, f64),
+    (scene_j, own_j, focal): &(Pose, Pose, f64),
+    ratio: f64,
+    points: &[Vector3<f64>],
+    noise: f64,
+) -> bool {
+    let gate = CHI_SQUARE_OF_TWO * (noise / focal).powi(2);
+    let agrees = |point: &&Vector3<f64>| {
+        let in_scene = scene_i.rotation.tr_mul(&(ratio * own_i.apply(point) - scene_i.translation));
+        let (at_rest, as_it_is) = (scene_j.apply(&in_scene), own_j.apply(point));
+        at_rest.z > 0.0 && (at_rest.xy() / at_rest.z - as_it_is.xy() / as_it_is.z).norm_squared() <= gate
+    };
+    2 * points.iter().filter(agrees).count() > points.len()
+}
