@@ -10,7 +10,7 @@ use super::exit::{Exit, Failure};
 use super::interrupt::Signals;
 use super::service::Service;
 use super::{print, prior_file};
-use crate::config::{Config, Endpoint};
+use crate::config::Config;
 use crate::engine::StoreState;
 use crate::telemetry;
 
@@ -190,13 +190,18 @@ pub async fn run(args: Args) -> Result<Exit, Failure> {
         print(text.trim_end())?;
         return Ok(Exit::Done);
     }
-    // Held to the end: it sends the last traces when dropped, inside the runtime.
-    let _tracing = telemetry::tracing::init(telemetry::tracing::Options {
+    let collector = config.otlp.endpoint.as_ref().map(|endpoint| telemetry::otlp::Options {
+        endpoint: endpoint.reveal(),
+        service_name: "scpsfm",
+        metrics_interval: config.otlp.metrics_interval(),
+    });
+    // Held to the end: it sends the last traces and metrics when dropped, inside the runtime.
+    let export = collector.map(telemetry::otlp::Export::begin).transpose().map_err(Failure::bad_config)?;
+    telemetry::tracing::init(telemetry::tracing::Options {
         format: config.log.format,
         filter: &config.log.filter,
         access: config.log.access,
-        otlp_endpoint: config.otlp.endpoint.as_ref().map(Endpoint::reveal),
-        service_name: "scpsfm",
+        export: export.as_ref(),
     })
     .map_err(Failure::bad_config)?;
     if let Some(path) = &config.compute.prior {
@@ -204,7 +209,8 @@ pub async fn run(args: Args) -> Result<Exit, Failure> {
     }
     raise_file_limit();
     let mut signals = Signals::listen()?;
-    let scrape = telemetry::metrics::install().map_err(Failure::internal)?;
+    let meter = export.as_ref().and_then(telemetry::otlp::Export::meter);
+    let scrape = telemetry::metrics::install(meter).map_err(Failure::internal)?;
     let backend = if config.compute.backend == crate::domain::Backend::Flex { "flex" } else { "ndarray" };
     telemetry::metrics::build_info(backend);
     let ready = telemetry::Readiness::default();

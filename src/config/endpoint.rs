@@ -1,4 +1,4 @@
-//! Where traces are sent, with a password that is never shown.
+//! Where traces and metrics are sent, with a password that is never shown.
 
 use std::fmt;
 use std::str::FromStr;

@@ -7,6 +7,7 @@ mod endpoint;
 mod exposure;
 mod file;
 mod http;
+mod otlp;
 mod retention;
 mod sections;
 mod webhooks;
@@ -20,8 +21,9 @@ use crate::domain::Limits;
 use crate::store::postgres::DatabaseUrl;
 pub use endpoint::Endpoint;
 pub use http::Http;
+pub use otlp::Otlp;
 pub use retention::Retention;
-pub use sections::{Auth, Compute, Engine, Log, Metrics, Otlp, Rates, Server, Store, Tls, Upload};
+pub use sections::{Auth, Compute, Engine, Log, Metrics, Rates, Server, Store, Tls, Upload};
 pub use webhooks::Webhooks;
 pub use weights::TenantWeights;
 
@@ -227,8 +229,10 @@ impl Config {
                 right: "levels by module, such as `info` or `info,scpsfm::engine=debug`",
             });
         }
+        at_least_one("otlp.metrics_interval_seconds", self.otlp.metrics_interval_seconds)?;
         self.http.validate()?;
         self.tls.validate()?;
+        self.otlp.validate()?;
         Ok(exposure::check(&self.server, &self.http, &self.tls, &self.auth)?)
     }
 }

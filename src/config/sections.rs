@@ -9,7 +9,7 @@ use serde::de::IntoDeserializer;
 use serde::{Deserialize, Deserializer, Serialize};
 
 use super::weights::TenantWeights;
-use super::{Endpoint, Error, Retention};
+use super::{Error, Retention};
 use crate::domain::Backend;
 use crate::parallel::Threads;
 use crate::rpc::keys::KeyRing;
@@ -362,16 +362,6 @@ impl Default for Log {
         // make many for each job, refusals are told without it, and the audit log tells what changed.
         Self { format: Format::default(), filter: "info".into(), access: false }
     }
-}
-
-/// Export of traces.
-#[derive(Debug, Clone, Default, PartialEq, Eq, Serialize, Deserialize)]
-#[serde(default, deny_unknown_fields)]
-pub struct Otlp {
-    /// Collector (gRPC), e.g. `http://127.0.0.1:4317`, or `https://`, trusted by the system's authorities. None by
-    /// default: a server sends nothing anywhere unasked. Wherever the configuration is shown, a password in it is not.
-    #[serde(skip_serializing_if = "Option::is_none")]
-    pub endpoint: Option<Endpoint>,
 }
 
 fn address<'de, D: Deserializer<'de>>(deserializer: D) -> Result<SocketAddr, D::Error> {

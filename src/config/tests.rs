@@ -68,7 +68,9 @@ fn later_sources_win_key_by_key() {
 #[test]
 fn a_printed_configuration_reads_back() {
     let flags = [("otlp.endpoint", "http://collector:4317".to_owned()), ("engine.workers", "3".to_owned())];
-    let config = Config::from_sources(None, vec![], &flags).expect("configuration");
+    let environment = variables(&[("SCPSFM_OTLP__METRICS", "true"), ("SCPSFM_OTLP__METRICS_INTERVAL_SECONDS", "15")]);
+    let config = Config::from_sources(None, environment, &flags).expect("configuration");
+    assert_eq!(config.otlp.metrics_interval(), Some(std::time::Duration::from_secs(15)));
     let printed = file(&config.to_toml().expect("TOML"));
     assert_eq!(Config::from_sources(Some(printed.path()), vec![], &[]).expect("configuration"), config);
 }
@@ -180,6 +182,8 @@ fn errors_name_the_key_and_what_would_be_right() {
         ),
         (from_variable("SCPSFM_ENGINE_WORKERS", "4"), &["SCPSFM_ENGINE_WORKERS", "SCPSFM_ENGINE__WORKERS"]),
         (from_variable("SCPSFM_OTLP__ENDPOINT", "x:4317"), &["otlp.endpoint", "http://127.0.0.1:4317"]),
+        (from_variable("SCPSFM_OTLP__METRICS", "true"), &["otlp.metrics", "otlp.endpoint", "http://127.0.0.1:4317"]),
+        (from_file("[otlp]\nmetrics_interval_seconds = 0\n"), &["otlp.metrics_interval_seconds", "from 1 on"]),
         (from_file("[rates]\ncalls_burst = 1\n"), &["rates.calls_burst", "from 2 on", "upload"]),
         (from_file("[rates]\njobs_burst = 999\n"), &["rates.jobs_burst", "from 1000 on"]),
         (from_variable("SCPSFM_RATES_CALLS_PER_SECOND", "4"), &["SCPSFM_RATES__CALLS_PER_SECOND"]),

@@ -4,6 +4,7 @@
 //! command that has no scrape port) they do nothing.
 
 mod catalogue;
+mod export;
 mod guards;
 mod labels;
 mod process;
@@ -12,8 +13,10 @@ mod tenants;
 use std::sync::OnceLock;
 use std::time::{Duration, SystemTime};
 
-use metrics::{counter, gauge, histogram};
-use metrics_exporter_prometheus::{BuildError, Matcher, PrometheusBuilder, PrometheusHandle, PrometheusRecorder};
+use metrics::{Recorder, counter, gauge, histogram};
+use metrics_exporter_prometheus::{BuildError, Matcher, PrometheusBuilder, PrometheusHandle};
+use metrics_util::layers::FanoutBuilder;
+use opentelemetry::metrics::Meter;
 
 use crate::domain::job::{Job, JobState};
 use crate::domain::{Grade, Proposal, Stage};
@@ -26,19 +29,20 @@ pub use labels::{
 use labels::{NONE, grade_name};
 pub use tenants::tenant_jobs;
 
-/// Installs the process-wide recorder, once; later calls return the same handle.
+/// Installs the process-wide recorder, once; later calls return the same handle and do not use their meter.
+///
+/// With a `meter`, which [`Export`](super::otlp::Export) has, everything is recorded for it too.
 ///
 /// Everything whose labels are known beforehand exists at 0 from here on, so that the first scrape shows it and the
-/// first event is an increase.
+/// first event is an increase; but for histograms that are exported, which begin with their first sample.
 ///
 /// # Errors
 /// When another recorder was installed by someone else.
-pub fn install() -> Result<PrometheusHandle, InstallError> {
+pub fn install(meter: Option<Meter>) -> Result<PrometheusHandle, InstallError> {
     static HANDLE: OnceLock<Result<PrometheusHandle, InstallError>> = OnceLock::new();
     HANDLE
         .get_or_init(|| {
-            let recorder = recorder().map_err(|error| InstallError(error.to_string()))?;
-            let handle = recorder.handle();
+            let (recorder, handle) = recorder(meter.as_ref()).map_err(|error| InstallError(error.to_string()))?;
             metrics::set_global_recorder(recorder).map_err(|error| InstallError(error.to_string()))?;
             Ok(handle)
         })
@@ -47,7 +51,7 @@ pub fn install() -> Result<PrometheusHandle, InstallError> {
 
 /// The page that is scraped, as of now.
 pub fn page(recorder: &PrometheusHandle) -> String {
-    if let Some(usage) = process::Usage::read() {
+    if let Some(usage) = process::Usage::latest() {
         gauge!(PROCESS_MEMORY.name).set(usage.memory_bytes as f64);
         counter!(PROCESS_CPU.name).absolute(usage.cpu_seconds);
         gauge!(PROCESS_FILES.name).set(usage.open_files as f64);
@@ -62,8 +66,8 @@ pub fn page(recorder: &PrometheusHandle) -> String {
 #[error("metrics recorder: {0}")]
 pub struct InstallError(String);
 
-/// A recorder that knows every metric.
-fn recorder() -> Result<PrometheusRecorder, BuildError> {
+/// A recorder that knows every metric, for the page and, where there is a meter, for the export.
+fn recorder(meter: Option<&Meter>) -> Result<(Box<dyn Recorder + Sync>, PrometheusHandle), BuildError> {
     let mut builder = PrometheusBuilder::new();
     for metric in ALL {
         if let Kind::Histogram(buckets) = metric.kind {
@@ -71,13 +75,21 @@ fn recorder() -> Result<PrometheusRecorder, BuildError> {
         }
     }
     let recorder = builder.build_recorder();
+    let handle = recorder.handle();
+    let recorder: Box<dyn Recorder + Sync> = match meter {
+        Some(meter) => {
+            let exported = export::OtlpRecorder::new(meter);
+            Box::new(FanoutBuilder::default().add_recorder(recorder).add_recorder(exported).build())
+        }
+        None => Box::new(recorder),
+    };
     metrics::with_local_recorder(&recorder, || {
         for metric in ALL {
             describe(metric);
         }
         create_known_series();
     });
-    Ok(recorder)
+    Ok((recorder, handle))
 }
 
 fn describe(metric: &Metric) {

@@ -166,7 +166,7 @@ mod tests {
     #[tokio::test]
     async fn the_port_serves_metrics_and_follows_the_latch_until_it_is_shut() {
         let ready = Readiness::default();
-        let scrape = metrics::install().expect("recorder");
+        let scrape = metrics::install(None).expect("recorder");
         let listen = "127.0.0.1:0".parse().expect("address");
         let server =
             bind(Options { listen, scrape, ready: ready.clone(), silence: Options::SILENCE }).await.expect("bind");
@@ -194,7 +194,7 @@ mod tests {
 
     #[tokio::test]
     async fn a_connection_that_says_nothing_is_ended_and_one_that_scrapes_is_not() {
-        let scrape = metrics::install().expect("recorder");
+        let scrape = metrics::install(None).expect("recorder");
         let listen = "127.0.0.1:0".parse().expect("address");
         let silence = std::time::Duration::from_secs(1);
         let server = bind(Options { listen, scrape, ready: Readiness::default(), silence }).await.expect("bind");

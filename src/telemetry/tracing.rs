@@ -14,11 +14,7 @@ use std::time::SystemTime;
 use opentelemetry::propagation::TextMapPropagator;
 use opentelemetry::trace::{Span as _, SpanKind, TraceContextExt, Tracer, TracerProvider};
 use opentelemetry::{Context, KeyValue, global};
-use opentelemetry_otlp::tonic_types::transport::ClientTlsConfig;
-use opentelemetry_otlp::{SpanExporter, WithExportConfig, WithTonicConfig};
-use opentelemetry_sdk::Resource;
 use opentelemetry_sdk::propagation::TraceContextPropagator;
-use opentelemetry_sdk::trace::SdkTracerProvider;
 use serde::{Deserialize, Serialize};
 use tracing::{Span, error_span, field};
 use tracing_opentelemetry::OpenTelemetrySpanExt;
@@ -27,12 +23,9 @@ use tracing_subscriber::fmt::MakeWriter;
 use tracing_subscriber::layer::SubscriberExt;
 use tracing_subscriber::{EnvFilter, Layer, Registry};
 
+use super::otlp::{Export, SCOPE};
 use crate::domain::Stage;
 use crate::domain::job::JobName;
-
-/// Target of every span of ours, and name of the instrumentation scope. Only this target is exported: spans of the
-/// transport would feed the exporter its own calls.
-const SCOPE: &str = "scpsfm";
 
 /// Target of the access log: one line a call.
 pub const ACCESS: &str = "scpsfm::access";
@@ -51,7 +44,7 @@ pub enum Format {
     Json,
 }
 
-/// What to log and where to send traces.
+/// What to log and where traces go.
 #[derive(Debug, Clone, Copy)]
 pub struct Options<'a> {
     pub format: Format,
@@ -59,10 +52,8 @@ pub struct Options<'a> {
     pub filter: &'a str,
     /// Whether the access log is written.
     pub access: bool,
-    /// OTLP collector (gRPC), e.g. `http://127.0.0.1:4317`, or `https://`; `None` exports nothing.
-    pub otlp_endpoint: Option<&'a str>,
-    /// `service.name` of the traces.
-    pub service_name: &'static str,
+    /// Where traces go; `None` exports none.
+    pub export: Option<&'a Export>,
 }
 
 /// Why logging or tracing could not begin.
@@ -70,44 +61,22 @@ pub struct Options<'a> {
 pub enum Error {
     #[error("log.filter: {0}")]
     Filter(#[from] tracing_subscriber::filter::ParseError),
-    #[error("otlp.endpoint: {0}")]
-    Exporter(#[from] opentelemetry_otlp::ExporterBuildError),
-    #[error("otlp.endpoint: export needs a tokio runtime, and none runs here")]
-    NoRuntime,
     #[error("logging was already set up in this process")]
     AlreadySet,
-}
-
-/// Ends the export: sends what is left when dropped, which may block for seconds. Drop it while the runtime, of more
-/// than one thread, still runs: the connection to the collector lives there.
-#[must_use = "traces are flushed when this is dropped"]
-#[derive(Debug)]
-pub struct Guard {
-    provider: Option<SdkTracerProvider>,
-}
-
-impl Drop for Guard {
-    fn drop(&mut self) {
-        if let Some(Err(error)) = self.provider.take().map(|provider| provider.shutdown()) {
-            tracing::warn!(%error, "the last traces were not exported");
-        }
-    }
 }
 
 /// Sets up logs (on stderr) and traces for the whole process.
 ///
 /// # Errors
-/// See [`Error`]. With an `otlp_endpoint` it must be called inside a tokio runtime, which carries the export. A
-/// collector that cannot be reached is no error: traces are then dropped, with a log line.
-pub fn init(options: Options<'_>) -> Result<Guard, Error> {
+/// See [`Error`].
+pub fn init(options: Options<'_>) -> Result<(), Error> {
     let ansi = std::io::stderr().is_terminal();
-    let (subscriber, guard) = build(options, std::io::stderr, ansi)?;
-    tracing::subscriber::set_global_default(subscriber).map_err(|_| Error::AlreadySet)?;
-    Ok(guard)
+    let subscriber = build(options, std::io::stderr, ansi)?;
+    tracing::subscriber::set_global_default(subscriber).map_err(|_| Error::AlreadySet)
 }
 
 /// The subscriber of [`init`], writing its lines to `writer`.
-fn build<W>(options: Options<'_>, writer: W, ansi: bool) -> Result<(impl tracing::Subscriber + use<W>, Guard), Error>
+fn build<W>(options: Options<'_>, writer: W, ansi: bool) -> Result<impl tracing::Subscriber + use<W>, Error>
 where
     W: for<'w> MakeWriter<'w> + Send + Sync + 'static,
 {
@@ -116,8 +85,8 @@ where
         Format::Human => lines.boxed(),
         Format::Json => lines.json().flatten_event(true).boxed(),
     };
-    let provider = options.otlp_endpoint.map(|endpoint| provider(endpoint, options.service_name)).transpose()?;
-    let export = provider.as_ref().map(|provider| {
+    let export = options.export.map(|export| {
+        let provider = export.traces();
         global::set_tracer_provider(provider.clone());
         tracing_opentelemetry::layer()
             .with_tracer(provider.tracer(SCOPE))
@@ -127,25 +96,7 @@ where
     let filter = EnvFilter::try_new(options.filter)?
         .add_directive(format!("{ACCESS}={access}").parse()?)
         .add_directive(format!("{AUDIT}=info").parse()?);
-    let subscriber = Registry::default().with(export).with(lines.with_filter(filter));
-    Ok((subscriber, Guard { provider }))
-}
-
-fn provider(endpoint: &str, service_name: &'static str) -> Result<SdkTracerProvider, Error> {
-    if tokio::runtime::Handle::try_current().is_err() {
-        return Err(Error::NoRuntime);
-    }
-    let exporter = SpanExporter::builder().with_tonic().with_endpoint(endpoint);
-    let exporter = match endpoint.starts_with("https:") {
-        true => exporter.with_tls_config(ClientTlsConfig::new().with_native_roots()),
-        false => exporter,
-    };
-    let exporter = exporter.build()?;
-    let resource = Resource::builder()
-        .with_service_name(service_name)
-        .with_attribute(KeyValue::new("service.version", env!("CARGO_PKG_VERSION")))
-        .build();
-    Ok(SdkTracerProvider::builder().with_batch_exporter(exporter).with_resource(resource).build())
+    Ok(Registry::default().with(export).with(lines.with_filter(filter)))
 }
 
 /// The trace context that a `traceparent` header states; an empty one for none or a malformed one, as W3C asks.
@@ -221,10 +172,6 @@ pub fn attempt_span(job: &JobName, attempt: u32, traceparent: Option<&str>) -> S
 pub fn stage_span(attempt: &Span, stage: Stage) -> Span {
     error_span!(target: SCOPE, parent: attempt, "stage", otel.name = stage.name(), stage = stage.name())
 }
-
-#[cfg(test)]
-#[path = "../../tests/it/support/collector.rs"]
-mod collector;
 
 #[cfg(test)]
 mod tests;

@@ -10,7 +10,7 @@ use scpsfm::config::Config;
 use crate::support::program::{program, run};
 
 /// Seconds that a server takes at most to stop what its drain left: docs/operation.md tells them.
-const STOP_SECONDS: u64 = 22;
+const STOP_SECONDS: u64 = 27;
 
 fn deployed(name: &str) -> String {
     let path = PathBuf::from(env!("CARGO_MANIFEST_DIR")).join("deploy/systemd").join(name);

@@ -5,6 +5,7 @@ use std::path::Path;
 use std::process::Stdio;
 use std::time::Duration;
 
+use opentelemetry_proto::tonic::collector::metrics::v1::metrics_service_server::MetricsServiceServer;
 use opentelemetry_proto::tonic::collector::trace::v1::trace_service_server::TraceServiceServer;
 use rustix::process::Signal;
 use scpsfm::domain::Stage;
@@ -15,7 +16,7 @@ use tonic::transport::{Channel, Identity, ServerTlsConfig};
 
 use crate::http::request;
 use crate::support::certificates::Authority;
-use crate::support::collector::{Collector, attribute, hex, only};
+use crate::support::collector::{Collector, attribute, hex, only, samples, text};
 use crate::support::keys::{NORTH, SOUTH, keyed};
 use crate::support::live::{connected, created, easy, lasting, reaches, small};
 use crate::support::program::Serving;
@@ -180,7 +181,7 @@ async fn a_job_that_takes_its_server_down_fails_and_is_counted_by_the_next() {
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn a_job_is_one_trace_under_its_callers_and_every_line_of_it_bears_its_name() {
+async fn a_job_is_one_trace_under_its_callers_every_line_of_it_bears_its_name_and_metrics_are_exported() {
     const TRACE_ID: &str = "4bf92f3577b34da6a3ce929d0e0e4736";
     const CALLER_SPAN: &str = "00f067aa0ba902b7";
     let (collector, address) = Collector::start().await;
@@ -188,7 +189,12 @@ async fn a_job_is_one_trace_under_its_callers_and_every_line_of_it_bears_its_nam
     let data_dir = directory.path().join("data");
     let log = directory.path().join("log");
     let endpoint = format!("http://{address}");
-    let export = [("SCPSFM_OTLP__ENDPOINT", endpoint.as_str())];
+    let export = [
+        ("SCPSFM_OTLP__ENDPOINT", endpoint.as_str()),
+        ("SCPSFM_OTLP__METRICS", "true"),
+        // Longer than the test: what is exported is sent at the end.
+        ("SCPSFM_OTLP__METRICS_INTERVAL_SECONDS", "3600"),
+    ];
     let mut server = Serving::start_with(&data_dir, &export, File::create(&log).expect("a log file"));
     let mut jobs = connected(&server).await;
     let mut request = tonic::Request::new(easy(1));
@@ -196,6 +202,8 @@ async fn a_job_is_one_trace_under_its_callers_and_every_line_of_it_bears_its_nam
     request.metadata_mut().insert("traceparent", traceparent.parse().expect("ASCII"));
     let name = jobs.create_job(request).await.expect("a job").into_inner().name;
     reaches(&mut jobs, &name, &[JobState::Succeeded]).await;
+    // Of what is compared below the last that a job's end records.
+    let page = scrape_until(&server, |page| page.value("scpsfm_solve_iterations_count") > 0.0).await;
     // A server that drains sends what it has: nothing is waited for.
     server.running.signal(Signal::TERM);
     assert!(tokio::task::block_in_place(|| server.running.wait()).success());
@@ -217,6 +225,8 @@ async fn a_job_is_one_trace_under_its_callers_and_every_line_of_it_bears_its_nam
         assert!(of_stage.all(|span| span.parent_span_id == attempt.span_id), "{stage}");
     }
 
+    assert_exported(&collector, &page);
+
     let serving = logged(&log, "serving");
     assert_eq!((&serving["version"], &serving["recovered_jobs"]), (&env!("CARGO_PKG_VERSION").into(), &0.into()));
     assert_eq!((&serving["store_kind"], &serving["queued_jobs"]), (&"sqlite".into(), &0.into()));
@@ -235,6 +245,35 @@ async fn a_job_is_one_trace_under_its_callers_and_every_line_of_it_bears_its_nam
     for line in of_attempt {
         assert_eq!(line["span"]["job"], name.as_str(), "{line}");
     }
+}
+
+/// Asserts that the one export is of this server and holds what `page` showed before.
+fn assert_exported(collector: &Collector, page: &Page) {
+    let exports = collector.metrics();
+    assert_eq!(exports.len(), 1, "one export, at the end");
+    let resource = &exports[0].resource.as_ref().expect("a resource").attributes;
+    assert_eq!(text(resource, "service.name").as_deref(), Some("scpsfm"));
+    assert_eq!(text(resource, "service.version").as_deref(), Some(env!("CARGO_PKG_VERSION")));
+    let scopes: Vec<_> = exports[0].scope_metrics.iter().map(|metrics| &metrics.scope).collect();
+    assert!(matches!(scopes[..], [Some(scope)] if scope.name == "scpsfm"), "{scopes:?}");
+    let samples = samples(&exports[0]);
+    for series in [
+        "scpsfm_jobs_created_total",
+        "scpsfm_jobs_total{state=\"SUCCEEDED\"}",
+        "scpsfm_jobs_total{state=\"FAILED\"}",
+        "scpsfm_workers",
+        "scpsfm_queue_capacity",
+        "scpsfm_job_duration_seconds_count{state=\"SUCCEEDED\"}",
+        "scpsfm_job_duration_seconds_sum{state=\"SUCCEEDED\"}",
+        "scpsfm_solve_iterations_sum",
+        "scpsfm_queue_wait_seconds_count",
+    ] {
+        assert_eq!(samples.get(series), Some(&page.value(series)), "{series}");
+    }
+    assert_eq!(samples["scpsfm_jobs_total{state=\"SUCCEEDED\"}"], 1.0);
+    assert_eq!(samples["scpsfm_workers_busy"], 0.0, "as it is at the end");
+    assert_eq!(samples["scpsfm_tenant_jobs{state=\"QUEUED\",tenant=\"OTHER\"}"], 0.0);
+    assert!(samples["process_resident_memory_bytes"] > 1e6 && samples["process_open_fds"] > 0.0);
 }
 
 /// What a log in JSON holds so far; its last line may be on its way.
@@ -398,6 +437,7 @@ async fn traces_go_to_a_collector_over_tls() {
         .tls_config(ServerTlsConfig::new().identity(identity))
         .expect("a certificate")
         .add_service(TraceServiceServer::new(collector.clone()))
+        .add_service(MetricsServiceServer::new(collector.clone()))
         .serve_with_incoming(tokio_stream::wrappers::TcpListenerStream::new(listener));
     tokio::spawn(collecting);
     let export = [("SCPSFM_OTLP__ENDPOINT", endpoint.as_str()), ("SSL_CERT_FILE", trusted.to_str().expect("UTF-8"))];
@@ -408,4 +448,5 @@ async fn traces_go_to_a_collector_over_tls() {
     server.running.signal(Signal::TERM);
     assert!(tokio::task::block_in_place(|| server.running.wait()).success());
     assert_eq!(attribute(only(&collector.spans(), "submit"), "job"), Some(name));
+    assert!(collector.metrics().is_empty(), "metrics are exported only with otlp.metrics");
 }

@@ -1,10 +1,15 @@
 //! What the process takes of the machine, as Linux tells it.
 
+use std::sync::{Mutex, PoisonError};
+
+use super::catalogue::{Metric, PROCESS_CPU, PROCESS_FILES, PROCESS_MEMORY};
+
 /// Ticks a second in which Linux tells processor time to programs, on every architecture that it still runs on
 /// (`USER_HZ`).
 const TICKS_A_SECOND: u64 = 100;
 
 /// What the process takes.
+#[derive(Debug, Clone, Copy)]
 pub(super) struct Usage {
     pub memory_bytes: u64,
     pub cpu_seconds: u64,
@@ -12,8 +17,17 @@ pub(super) struct Usage {
 }
 
 impl Usage {
-    /// As of now; `None` where the system is another.
-    pub(super) fn read() -> Option<Self> {
+    /// As of now, or when it was last read: processor time must not fall to 0 where files cannot be opened. `None` where
+    /// it never was, on another system.
+    pub(super) fn latest() -> Option<Self> {
+        static LATEST: Mutex<Option<Usage>> = Mutex::new(None);
+        let mut latest = LATEST.lock().unwrap_or_else(PoisonError::into_inner);
+        *latest = Self::read().or(*latest);
+        *latest
+    }
+
+    /// As of now; `None` where files cannot be opened, and where the system is another.
+    fn read() -> Option<Self> {
         let file = |name: &str| std::fs::read_to_string(format!("/proc/self/{name}")).ok();
         Some(Self {
             memory_bytes: memory_bytes(&file("status")?)?,
@@ -21,6 +35,20 @@ impl Usage {
             open_files: std::fs::read_dir("/proc/self/fd").ok()?.count() as u64,
         })
     }
+}
+
+/// Value of a metric of the process as [`Usage::latest`] has it; `None` for every other metric.
+pub(super) fn value(metric: &Metric) -> Option<u64> {
+    let of: fn(Usage) -> u64 = if metric.name == PROCESS_MEMORY.name {
+        |usage| usage.memory_bytes
+    } else if metric.name == PROCESS_CPU.name {
+        |usage| usage.cpu_seconds
+    } else if metric.name == PROCESS_FILES.name {
+        |usage| usage.open_files
+    } else {
+        return None;
+    };
+    Usage::latest().map(of)
 }
 
 /// Of `/proc/self/status`, which has `VmRSS:  1234 kB`.

@@ -1,5 +1,5 @@
 //! Jobs by tenant. The recorder keeps every series for good, and tenants come and go: these series are written on the
-//! page as they are now, so that there are never more than a few.
+//! page, and exported, as they are now, so that there are never more than a few.
 
 use std::fmt::Write;
 use std::sync::{Mutex, PoisonError};
@@ -30,6 +30,11 @@ pub(super) fn page() -> String {
     text(&LATEST.lock().unwrap_or_else(PoisonError::into_inner))
 }
 
+/// Calls `visit` with the labels and the value of every series.
+pub(super) fn for_each(visit: impl FnMut([(&'static str, &str); 2], u64)) {
+    visit_all(&LATEST.lock().unwrap_or_else(PoisonError::into_inner), visit);
+}
+
 /// The tenants that have most jobs.
 fn bounded(mut tenants: Vec<OfTenant>) -> Vec<OfTenant> {
     tenants.sort_by_key(|(tenant, jobs)| (std::cmp::Reverse(jobs[0] + jobs[1]), tenant.clone()));
@@ -42,13 +47,19 @@ fn bounded(mut tenants: Vec<OfTenant>) -> Vec<OfTenant> {
 fn text(tenants: &[OfTenant]) -> String {
     let name = TENANT_JOBS.name;
     let mut text = format!("# HELP {name} {}\n# TYPE {name} gauge\n", TENANT_JOBS.help);
+    visit_all(tenants, |[(_, tenant), (_, state)], count| {
+        // Never fails: it is a text in memory.
+        let _ = writeln!(text, "{name}{{tenant=\"{tenant}\",state=\"{state}\"}} {count}");
+    });
+    text
+}
+
+fn visit_all(tenants: &[OfTenant], mut visit: impl FnMut([(&'static str, &str); 2], u64)) {
     for (tenant, jobs) in tenants {
-        for (state, count) in STATES.iter().zip(jobs) {
-            // Never fails: it is a text in memory.
-            let _ = writeln!(text, "{name}{{tenant=\"{tenant}\",state=\"{state}\"}} {count}");
+        for (state, count) in STATES.into_iter().zip(jobs) {
+            visit([("tenant", tenant), ("state", state)], *count);
         }
     }
-    text
 }
 
 #[cfg(test)]

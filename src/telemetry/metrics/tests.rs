@@ -12,10 +12,10 @@ const RULES: &str = include_str!("../../../deploy/prometheus-rules.yml");
 
 /// The page after `act`, on a recorder of its own.
 pub(crate) fn page_after(act: impl FnOnce()) -> String {
-    let recorder = recorder().expect("recorder");
+    let (recorder, handle) = recorder(None).expect("recorder");
     metrics::with_local_recorder(&recorder, || {
         act();
-        page(&recorder.handle())
+        page(&handle)
     })
 }
 
@@ -25,7 +25,7 @@ pub(crate) fn value(page: &str, series: &str) -> Option<f64> {
     line[series.len() + 1..].parse().ok()
 }
 
-fn ended(state: JobState, grade: Option<Grade>) -> Job {
+pub(crate) fn ended(state: JobState, grade: Option<Grade>) -> Job {
     let start = SystemTime::UNIX_EPOCH + Duration::from_secs(1_000);
     let succeeded = state == JobState::Succeeded;
     let summary = Summary {
@@ -159,8 +159,8 @@ fn a_finished_job_counts_by_its_state_and_only_results_by_their_grade() {
 
 #[test]
 fn guards_give_back_what_they_took_and_a_dropped_call_is_cancelled() {
-    let recorder = recorder().expect("recorder");
-    let render = || recorder.handle().render();
+    let (recorder, handle) = recorder(None).expect("recorder");
+    let render = || handle.render();
     metrics::with_local_recorder(&recorder, || {
         let (worker, watcher_guard) = (busy_worker(), watcher());
         let call = RpcCall::begin("scpsfm.v1.JobService/WatchJob");
