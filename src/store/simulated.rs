@@ -36,6 +36,8 @@ pub(crate) enum Bug {
     MissedEvent,
     /// Jobs that lost attempts run among others.
     SuspectsTogether,
+    /// A tenant runs more jobs at once than it may.
+    UnboundedTenant,
 }
 
 /// What happens to the operations of one server from now on.
@@ -329,6 +331,9 @@ impl Connection for SimulatedConnection {
         let statement = match bug {
             Some(Bug::DoubleClaim) if statement.sql().contains("ORDER BY priority") => {
                 statement.replaced("state = 'QUEUED'", "state IN ('QUEUED', 'RUNNING')")
+            }
+            Some(Bug::UnboundedTenant) if statement.sql().contains("AS leased GROUP BY tenant") => {
+                statement.replaced("COUNT(*) >=", "COUNT(*) < 0 AND 0 <")
             }
             Some(Bug::SuspectsTogether) if statement.sql().contains("state = 'QUEUED'") => {
                 statement.replaced("attempt, lost_attempts,", "attempt, 0 AS lost_attempts,")

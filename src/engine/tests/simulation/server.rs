@@ -1,7 +1,7 @@
 //! One simulated server: an engine on a runtime of its own.
 
 use std::sync::atomic::{AtomicBool, Ordering};
-use std::sync::{Arc, Mutex, PoisonError};
+use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::time::Duration;
 
 use tokio::runtime::{Builder, Runtime};
@@ -11,10 +11,12 @@ use tokio::time::sleep;
 
 use super::check::result_of;
 use super::{MAX_ATTEMPTS, MAX_JOBS, Plan};
+use crate::domain::job::JobName;
 use crate::engine::drain::Threads;
 use crate::engine::tests::{input, progress, solution};
 use crate::engine::worker::{Assigned, Worker};
 use crate::engine::{Drained, Engine, Error, Options};
+use crate::store::TenantShares;
 use crate::store::simulated::{Faults, Link, Simulated};
 
 /// What becomes of a job, by its settings' seed.
@@ -43,6 +45,41 @@ impl JobBehavior {
     }
 }
 
+/// The jobs that workers of all servers solve now.
+#[derive(Debug, Clone, Default)]
+pub(super) struct Solving(Arc<Mutex<Vec<JobName>>>);
+
+impl Solving {
+    pub(super) fn jobs(&self) -> Vec<JobName> {
+        self.locked().clone()
+    }
+
+    /// One more, until the guard is dropped, as it is when its server dies.
+    fn begin(&self, name: &JobName) -> Solved {
+        self.locked().push(name.clone());
+        Solved { name: name.clone(), solving: self.clone() }
+    }
+
+    fn locked(&self) -> MutexGuard<'_, Vec<JobName>> {
+        self.0.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+}
+
+/// Takes a job from what is solved when dropped.
+struct Solved {
+    name: JobName,
+    solving: Solving,
+}
+
+impl Drop for Solved {
+    fn drop(&mut self) {
+        let mut jobs = self.solving.locked();
+        if let Some(place) = jobs.iter().position(|name| *name == self.name) {
+            jobs.remove(place);
+        }
+    }
+}
+
 pub(super) struct Server {
     runtime: Runtime,
     link: Arc<Mutex<Link>>,
@@ -59,6 +96,7 @@ impl Server {
         number: u64,
         connect: impl FnOnce() -> Simulated<SHARED>,
         plan: Plan,
+        solving: Solving,
     ) -> Self {
         let runtime = Builder::new_current_thread().enable_time().start_paused(true).build().expect("a runtime");
         let dead = Arc::new(AtomicBool::new(false));
@@ -70,6 +108,7 @@ impl Server {
             lease: plan.lease,
             max_attempts: MAX_ATTEMPTS,
             worker_name: format!("server-{number}"),
+            shares: Arc::new(TenantShares { max_running: plan.max_running, ..TenantShares::default() }),
             clock: store.wall_clock(),
             ..Options::default()
         };
@@ -78,10 +117,10 @@ impl Server {
         let workers = (0..plan.workers)
             .map(|_| {
                 let (worker, inbox) = Worker::with_inbox();
-                let (dead, alive) = (dead.clone(), alive.clone());
+                let (dead, alive, solving) = (dead.clone(), alive.clone(), solving.clone());
                 tokio::spawn(async move {
                     let _alive = alive;
-                    work(inbox, dead).await;
+                    work(inbox, dead, solving).await;
                 });
                 worker
             })
@@ -147,11 +186,12 @@ impl Server {
 }
 
 /// A worker, which is a thread outside of simulations.
-async fn work(mut inbox: mpsc::Receiver<Assigned>, dead: Arc<AtomicBool>) {
+async fn work(mut inbox: mpsc::Receiver<Assigned>, dead: Arc<AtomicBool>, solving: Solving) {
     while let Some(assignment) = inbox.recv().await {
         let seed = assignment.settings().seed;
         let step = JobBehavior::duration(seed) / 4;
         let Some(mut running) = assignment.begin() else { continue };
+        let solved = solving.begin(running.name());
         for iteration in 1..=4 {
             sleep(step).await;
             if running.is_stopped() {
@@ -161,10 +201,14 @@ async fn work(mut inbox: mpsc::Receiver<Assigned>, dead: Arc<AtomicBool>) {
         }
         match JobBehavior::of(seed) {
             JobBehavior::Succeed => {
+                drop(solved);
                 let result = result_of(running.name());
                 running.succeed(&solution(&input(), 1), result);
             }
-            JobBehavior::Fail => running.fail(),
+            JobBehavior::Fail => {
+                drop(solved);
+                running.fail();
+            }
             JobBehavior::Kill => {
                 dead.store(true, Ordering::Relaxed);
                 std::future::pending::<()>().await;
