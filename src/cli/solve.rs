@@ -67,8 +67,8 @@ pub struct Args {
     #[arg(long, short)]
     pub quiet: bool,
 
-    /// Threads to solve on; with --window, windows at a time, one thread each. The answers are the same [default: one a
-    /// core]
+    /// Threads to solve on, here and not with --server; with --window, windows at a time, one thread each. The answers
+    /// are the same [default: one a core]
     #[arg(long, value_name = "N", value_parser = clap::value_parser!(u16).range(1..=MOST_THREADS), conflicts_with = "server")]
     pub threads: Option<u16>,
 

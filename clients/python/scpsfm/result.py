@@ -376,8 +376,8 @@ class SecondStructure:
     """As `TrackResults.second_structure_number` has it, from 1."""
 
     kind: str | None
-    """`MOVING_BODY` (between most pairs of its views it moves) or `REPEATED_STRUCTURE` (between a fifth of them or more
-    it stands still: copies of one part of the scene, or a body that stood still for a while).
+    """`MOVING_BODY` (it stands still between less than a fifth of all pairs of its views) or `REPEATED_STRUCTURE`
+    (between a fifth or more: copies of one part of the scene, or a body that stood still for a while).
 
     `None`: it has no poses, or this version does not know the kind."""
 

@@ -326,9 +326,9 @@ pub struct TwoViewTrack {
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Serialize, Deserialize)]
 #[serde(rename_all = "SCREAMING_SNAKE_CASE")]
 pub enum SecondStructureKind {
-    /// Between most pairs of its views it moves.
+    /// It stands still between less than a fifth of all pairs of its views.
     MovingBody,
-    /// Between a fifth of all pairs of its views or more it stands still: copies of one part of the scene that were
+    /// It stands still between a fifth of all pairs of its views or more: copies of one part of the scene that were
     /// taken for each other, or a body that stood still for a while.
     RepeatedStructure,
 }

@@ -153,11 +153,12 @@ impl Reconstruction {
             return Ok(nothing(problem, Some(seed), warnings, recorder));
         }
         let structures = second_structures::verified(problem, structures, &judged.tracks.inlier);
-        warnings.extend(second_structures::mark(&structures, &mut judged.tracks));
+        judged.tracks.second_structure = second_structures::numbers(&structures);
         let second_structures: Vec<SecondStructure> = (1..)
             .zip(&structures)
             .map(|(number, structure)| second_structures::describe(problem, &self, structure, number))
             .collect::<Result<_, _>>()?;
+        warnings.extend(second_structures::warning(&second_structures, &judged.tracks.second_structure, inliers));
         warnings.extend(static_tracks::warning(problem, &judged.tracks.inlier));
         let frames = self.frames(problem);
         let backs: Vec<Option<Matrix4<f64>>> =

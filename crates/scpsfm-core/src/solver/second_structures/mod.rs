@@ -18,15 +18,17 @@ use super::recorder::Recorder;
 use super::search::affine::AffineSearch;
 use super::sequence::{self, Ended, ExtensionOptions, ProjectiveReconstruction};
 use super::view_selection::ViewSelectionOptions;
-use crate::domain::result::TrackResults;
+use crate::domain::result::{SecondStructure, SecondStructureKind};
 use crate::domain::{Method, Silent, SolveSettings, StopToken, Warning, WarningCode};
 
 options! {
     /// What counts as a second structure, and what is said of its motion.
     pub struct SecondStructureOptions {
-        /// Searches at most, each among the tracks that are left; so many structures are reported at most. Most inputs
-        /// have none, and then the first is the last.
-        most_searches: usize = 4,
+        /// Searches at most, each among the tracks that are left; so many structures are reported at most. Without a
+        /// second structure the first is the last.
+        most_searches: u64 = 6,
+        /// Searches that may fail once a structure was found. Each of wrong tracks takes a tenth of a second.
+        most_failures: u32 = 1,
         /// Gates from which a track counts as left out: nearer ones are of the reconstruction, with an outlier's share
         /// of noise.
         far_gates: f64 = 16.0,
@@ -81,7 +83,7 @@ impl Structure {
     /// # Errors
     /// [`Error::Stopped`]; [`Error::Internal`] for defects.
     pub fn of_tracks(problem: &Problem, geometry: &Geometry, tracks: Vec<bool>) -> Result<Self, Error> {
-        let reconstruction = reconstructed(problem, geometry, &tracks, |_| true)?.map(|(found, _)| found);
+        let reconstruction = reconstructed(problem, geometry, &tracks, 0, |_| true)?.map(|(found, _)| found);
         Ok(Self { tracks, reconstruction })
     }
 
@@ -112,8 +114,16 @@ pub fn find(
     };
     leave_out(&mut is_left, known);
     let mut found = Vec::new();
-    for _ in 0..OPTIONS.most_searches {
-        let Some(next) = searched(problem, geometry, &is_left)? else { break };
+    let mut failures = 0;
+    for search in 0..OPTIONS.most_searches {
+        let Some(next) = searched(problem, geometry, &is_left, search)? else {
+            failures += 1;
+            // Where there is one, another may have been missed among several: other samples may find it.
+            if found.is_empty() || failures > OPTIONS.most_failures {
+                break;
+            }
+            continue;
+        };
         leave_out(&mut is_left, &next.tracks);
         // A weak one may have been found before a strong one.
         if next.evidence(problem) >= OPTIONS.least_share * evidence {
@@ -147,12 +157,17 @@ pub fn rival(
 }
 
 /// Those of some tracks that make another projective reconstruction.
-fn searched(problem: &Problem, geometry: &Geometry, is_left: &[bool]) -> Result<Option<Structure>, Error> {
+///
+/// * `search`: how many there were before
+fn searched(problem: &Problem, geometry: &Geometry, is_left: &[bool], search: u64) -> Result<Option<Structure>, Error> {
     if is_left.iter().filter(|is_left| **is_left).count() < LEAST_INLIERS {
         return Ok(None);
     }
-    let passes = |block: &Block| passes_affine_check(block, problem.stop);
-    let Some((found, representative)) = reconstructed(problem, geometry, is_left, passes)? else { return Ok(None) };
+    // Of several bodies none need have most of what is left.
+    let passes = |block: &Block| search > 0 || passes_affine_check(block, problem.stop);
+    let Some((found, representative)) = reconstructed(problem, geometry, is_left, search, passes)? else {
+        return Ok(None);
+    };
     let agrees = |track: usize| found.tracks.binary_search(&representative[problem.representative[track]]).is_ok();
     let structure =
         Structure { tracks: (0..problem.tracks()).map(agrees).collect(), reconstruction: Some(found.clone()) };
@@ -163,11 +178,13 @@ fn searched(problem: &Problem, geometry: &Geometry, is_left: &[bool]) -> Result<
 /// A projective reconstruction of some tracks in the registered views of the largest component, behind the lenses of
 /// these, with the track that represents each; near-duplicates take no part.
 ///
+/// * `search`: by which samples
 /// * `is_promising`: which blocks are worth a search
 fn reconstructed(
     problem: &Problem,
     geometry: &Geometry,
     tracks: &[bool],
+    search: u64,
     is_promising: impl Fn(&Block) -> bool,
 ) -> Result<Option<(ProjectiveReconstruction, Vec<usize>)>, Error> {
     let is_registered = |view: usize| geometry.cameras[view].is_some() && geometry.component_of_view[view] == LARGEST;
@@ -175,7 +192,8 @@ fn reconstructed(
     let input = problem.input.restricted_to(|k| takes_part(problem.track_of(k)) && is_registered(problem.view_of(k)));
     // One detector found all tracks, so that the noise is known.
     let noise_px = Some(geometry.noise * problem.scale_px);
-    let settings = SolveSettings { method: Method::Geometry, noise_px, ..problem.settings.clone() };
+    let seed = problem.settings.seed.wrapping_add(search);
+    let settings = SolveSettings { method: Method::Geometry, noise_px, seed, ..problem.settings.clone() };
     let mut some = problem.of_some(&input, &settings);
     some.undone = lenses(problem, geometry, &some);
     let views = some.observed_views().len();
@@ -218,31 +236,35 @@ pub fn verified(problem: &Problem, mut structures: Vec<Structure>, inlier: &[boo
     structures
 }
 
-/// Marks the tracks of these structures by their numbers, from 1, and says so; `None` where there is none.
-pub fn mark(structures: &[Structure], tracks: &mut TrackResults) -> Option<Warning> {
-    if structures.is_empty() {
-        return None;
-    }
-    tracks.second_structure = vec![0; tracks.inlier.len()];
-    let mut counts = Vec::new();
+/// The number of the structure of each track, from 1; 0 for none, empty where there is none.
+pub fn numbers(structures: &[Structure]) -> Vec<u32> {
+    let mut numbers: Vec<u32> = structures.first().map_or_else(Vec::new, |first| vec![0; first.tracks.len()]);
     for (number, structure) in (1..).zip(structures) {
-        let of_structure = tracks.second_structure.iter_mut().zip(&structure.tracks).filter(|(_, is_of)| **is_of);
-        counts.push(of_structure.map(|(slot, _)| *slot = number).count().to_string());
+        let of_structure = numbers.iter_mut().zip(&structure.tracks).filter(|(_, is_of)| **is_of);
+        of_structure.for_each(|(slot, _)| *slot = number);
     }
-    let inliers = tracks.inlier.iter().filter(|inlier| **inlier).count();
-    let detail = match counts.as_slice() {
-        [most @ .., last] if !most.is_empty() => format!(
-            "{} and {last} tracks that are left out agree on rigid motions of their own: moving bodies, or repeated \
-             structures; the result is of {inliers} other tracks, not of all",
-            most.join(", ")
-        ),
-        _ => format!(
-            "{} tracks that are left out agree on another rigid motion: a second moving body, or a repeated structure; \
-             the result is of {inliers} other tracks, not of both",
-            counts.concat()
-        ),
+    numbers
+}
+
+/// Says of how many tracks these structures are, and what they are; `None` where there is none.
+///
+/// * `numbers`: that of the structure of each track
+/// * `inliers`: tracks of the result
+pub fn warning(structures: &[SecondStructure], numbers: &[u32], inliers: usize) -> Option<Warning> {
+    let one = |structure: &SecondStructure| {
+        let tracks = numbers.iter().filter(|number| **number == structure.number).count();
+        let kind = match structure.kind {
+            Some(SecondStructureKind::MovingBody) => "a body that moves against the scene of the result",
+            Some(SecondStructureKind::RepeatedStructure) => {
+                "a repeated structure, or a body that stands still at times"
+            }
+            None => "a second moving body, or a repeated structure",
+        };
+        format!("{tracks} tracks that are left out agree on another rigid motion: {kind}")
     };
-    Some(Warning::new(WarningCode::SecondStructure, detail))
+    let each: Vec<String> = structures.iter().map(one).collect();
+    let detail = format!("{}; the result is of {inliers} other tracks", each.join("; "));
+    (!each.is_empty()).then(|| Warning::new(WarningCode::SecondStructure, detail))
 }
 
 /// Whether each track is far from the largest component of the reconstruction, of those that a search may go by. What

@@ -1,21 +1,24 @@
 //! How a second structure moves: against the camera, whose calibration is known, and against the scene.
 
+use std::collections::BTreeSet;
+
 use nalgebra::Vector3;
 
 use super::{OPTIONS, Structure};
 use crate::domain::Grade;
 use crate::domain::result::{SecondStructure, SecondStructureKind, StructurePoint, StructurePose};
 use crate::geometry::Camera;
-use crate::geometry::bundle::Options;
 use crate::geometry::bundle::metric::{self, Intrinsics, IntrinsicsModel, IntrinsicsPrior, MetricReconstruction, Pose};
 use crate::geometry::metric::{cheirality, upgrade_calibrated};
 use crate::geometry::observation::Observation;
 use crate::geometry::statistics::{CHI_SQUARE_OF_TWO, median};
 use crate::solver::Error;
+use crate::solver::calibration::CalibrationOptions;
 use crate::solver::classification::Geometry;
+use crate::solver::grow::LEAST_INLIERS;
 use crate::solver::problem::Problem;
 use crate::solver::reconstruction::Reconstruction;
-use crate::solver::sequence::{ProjectiveReconstruction, widest_angle};
+use crate::solver::sequence::{GrowthOptions, ProjectiveReconstruction, widest_angle};
 use crate::solver::view_selection::{LEAST_VIEWS, evenly};
 
 /// Views that must see a point for it to be reported, as of a point of the scene.
@@ -64,8 +67,8 @@ pub fn describe(
 }
 
 /// The metric reconstruction of a structure under the calibration of the scene, in a frame and at a scale of its own,
-/// with its observations in the image; `None` where there is none that fits, is in front of its cameras, has parallax
-/// and is the only one.
+/// with the observations, in the image, of the points that fit; `None` where there is none that most points fit, that is
+/// in front of its cameras, has parallax and is the only one.
 fn calibrated(
     problem: &Problem,
     geometry: &Geometry,
@@ -81,34 +84,48 @@ fn calibrated(
     };
     let observations: Vec<Observation> = found.observations.iter().filter_map(in_image).collect();
     let (model, priors) = (IntrinsicsModel::FIXED, vec![IntrinsicsPrior::NONE; lenses.len()]);
+    let CalibrationOptions { fit, grades, .. } = &problem.calibration_options;
+    let of_scene = geometry.noise.max(fit.least_noise);
     let adjusted = |upgraded: MetricReconstruction| {
         // Every view has the lens that it has in the scene.
         let mut metric =
             MetricReconstruction { intrinsics: lenses.clone(), group_of: (0..lenses.len()).collect(), ..upgraded };
-        let options = Options::squared(OPTIONS.iterations);
+        // A wrong track may fit projective cameras that bend to it.
+        let options = GrowthOptions::METRIC.adjustment(OPTIONS.iterations, of_scene);
         let report = metric::adjust(&mut metric, &observations, model, &priors, &options, problem.stop);
         (metric, report.cost)
     };
-    let upgraded =
-        upgrade_calibrated(&cameras, &found.points, &found.observations, OPTIONS.plane_views, OPTIONS.planes);
+    let (views, planes) = (OPTIONS.plane_views, OPTIONS.planes);
+    let upgraded = upgrade_calibrated(&cameras, &found.points, &found.observations, views, planes);
     let mut minima: Vec<(MetricReconstruction, f64)> = upgraded.into_iter().map(adjusted).collect();
     problem.stopped()?;
     minima.retain(|(_, cost)| cost.is_finite());
     minima.sort_by(|a, b| a.1.total_cmp(&b.1));
-    let Some((best, others)) = minima.split_first() else { return Ok(None) };
-    let (metric, cost) = best;
-    let options = &problem.calibration_options;
-    let freedom = (2 * observations.len()).saturating_sub(metric.unknowns(metric.points.len(), 0));
-    let (noise, of_scene) = (options.fit.posterior_noise(*cost, freedom), geometry.noise.max(options.fit.least_noise));
+    let Some(((metric, cost), others)) = minima.split_first() else { return Ok(None) };
+    let kept = agreeing(metric, &observations, fit.rms_ratio_refusal * of_scene);
     let is_rival = |(other, other_cost): &(MetricReconstruction, f64)| {
-        other_cost - cost < options.grades.indistinguishable * noise.max(of_scene).powi(2)
+        other_cost - cost < grades.indistinguishable * of_scene.powi(2)
             && turned_apart(metric, other) > OPTIONS.other_poses
     };
-    let stands = noise <= options.fit.rms_ratio_refusal * of_scene
-        && cheirality(metric, &observations) >= options.grades.least_in_front
-        && median(&mut ray_angles(metric, &observations)) >= OPTIONS.least_angle
+    let points = |seen: &[Observation]| seen.iter().map(|seen| seen.point).collect::<BTreeSet<_>>().len();
+    let stands = 2 * points(&kept) > points(&observations)
+        && points(&kept) >= LEAST_INLIERS
+        && cheirality(metric, &kept) >= grades.least_in_front
+        && median(&mut ray_angles(metric, &kept)) >= OPTIONS.least_angle
         && !others.iter().any(is_rival);
-    Ok(stands.then(|| (metric.clone(), observations)))
+    Ok(stands.then(|| (metric.clone(), kept)))
+}
+
+/// The observations of the points that are within this root mean square of all of theirs.
+fn agreeing(metric: &MetricReconstruction, observations: &[Observation], limit: f64) -> Vec<Observation> {
+    let mut sums = vec![(0.0, 0.0); metric.points.len()];
+    for seen in observations {
+        let (sum, count) = &mut sums[seen.point];
+        *sum += metric.weighted_squared(seen);
+        *count += 2.0;
+    }
+    let agrees = |seen: &&Observation| sums[seen.point].0 <= sums[seen.point].1 * limit * limit;
+    observations.iter().filter(agrees).copied().collect()
 }
 
 /// The largest difference between the rotations of a view against the first in two reconstructions, radians.

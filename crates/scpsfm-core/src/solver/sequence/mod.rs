@@ -32,7 +32,7 @@ use std::ops::ControlFlow;
 
 pub use adjust::verified;
 pub use extended::Extended;
-pub use options::ExtensionOptions;
+pub use options::{ExtensionOptions, GrowthOptions};
 pub use projective::ProjectiveReconstruction;
 pub use structure::{component_of_track, widest_angle};
 
@@ -47,7 +47,6 @@ use super::view_selection::{SeedViews, ViewSelectionOptions};
 use super::{Error, near_duplicates, view_selection};
 use crate::domain::Stage;
 use extended::extend;
-use options::GrowthOptions;
 
 /// How subsets are searched, of which many are tried.
 const QUICK_SEED: Effort = Effort { is_seed: true, is_quick: true };
