@@ -34,8 +34,8 @@ Examples:
 
 Files in the output directory: result.json (the summary), tracks.csv, observations.csv (every answer under the ids \
 of the input), cameras.json, points.ply (where there are several parts: of the largest; points-part-1.ply and on hold \
-the others), report.html (open it in a browser), and where there are such points-two-view.ply (consistent tracks of two \
-views) and second-structures.json (bodies that move by themselves).";
+the others), report.html (open it in a browser), and where there are such points-two-view.ply (consistent tracks of \
+two views) and second-structures.json (bodies that move by themselves).";
 
 /// Solve one input
 ///

@@ -111,7 +111,7 @@ pub struct CameraGroupJson {
 pub struct SecondStructureCounts {
     /// As the column `second_structure` of `tracks.csv` has it.
     pub number: u32,
-    /// Null: it has no poses, or a kind that this version does not know.
+    /// Null: fewer than three views have poses, or it is a kind that this version does not know.
     pub kind: Option<SecondStructureKind>,
     /// Counts: its tracks, the views that have a pose against it, and its points.
     pub tracks: usize,

@@ -20,7 +20,7 @@ pub struct SecondStructuresJson {
 pub struct SecondStructureJson {
     /// As the column `second_structure` of `tracks.csv` has it.
     pub number: u32,
-    /// Null: it has no poses, or a kind that this version does not know.
+    /// Null: fewer than three views have poses, or it is a kind that this version does not know.
     pub kind: Option<SecondStructureKind>,
     /// The caller's ids of its tracks, in the order of `tracks.csv`.
     pub tracks: Vec<Label>,
@@ -30,8 +30,8 @@ pub struct SecondStructureJson {
     pub points: Vec<StructurePointJson>,
 }
 
-/// A view's pose in the frame of a structure: `x ~ K (R X + t)` for its points `X`, before the distortion of the lens. Matrices
-/// row by row.
+/// A view's pose in the frame of a structure: `x ~ K (R X + t)` for its points `X`, before the distortion of the lens.
+/// Matrices row by row.
 #[derive(Debug, Clone, Serialize)]
 #[allow(non_snake_case, reason = "the field's name for this matrix is a capital")]
 pub struct StructureViewJson {

@@ -379,7 +379,7 @@ class SecondStructure:
     """`MOVING_BODY` (it stands still between less than a fifth of all pairs of its views) or `REPEATED_STRUCTURE`
     (between a fifth or more: copies of one part of the scene, or a body that stood still for a while).
 
-    `None`: it has no poses, or this version does not know the kind."""
+    `None`: fewer than three views have poses, or this version does not know the kind."""
 
     view: NDArray[np.int64]
     """Index of each view that has a pose in its frame, in rising order. (views,). Empty without a metric result, and

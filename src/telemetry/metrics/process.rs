@@ -17,8 +17,8 @@ pub(super) struct Usage {
 }
 
 impl Usage {
-    /// As of now, or when it was last read: processor time must not fall to 0 where files cannot be opened. `None` where
-    /// it never was, on another system.
+    /// As of now, or when it was last read: processor time must not fall to 0 where files cannot be opened. `None`
+    /// where it never was, on another system.
     pub(super) fn latest() -> Option<Self> {
         static LATEST: Mutex<Option<Usage>> = Mutex::new(None);
         let mut latest = LATEST.lock().unwrap_or_else(PoisonError::into_inner);

@@ -338,7 +338,7 @@ pub enum SecondStructureKind {
 pub struct SecondStructure {
     /// As [`TrackResults::second_structure`] has it.
     pub number: u32,
-    /// `None`: there are no poses, or it is a kind that this version does not know.
+    /// `None`: fewer than three views have poses, or it is a kind that this version does not know.
     pub kind: Option<SecondStructureKind>,
     /// By view; views of its reconstruction that have a pose in the scene. Empty without a metric result, and where its
     /// tracks make no reconstruction under the calibration: one that fits, has parallax, is in front of its cameras and

@@ -19,17 +19,18 @@ macro_rules! ensure {
     };
 }
 
-/// The bounds on what waits and on what runs of one tenant, which hold at all times.
+/// The bound on what waits, which holds at all times, and where `max_running` is given, that on what runs of one
+/// tenant.
 pub(super) fn at_each_step(cluster: &Cluster, solving: &Solving, max_running: Option<u32>) -> Result<(), String> {
     let new = cluster.numbers("SELECT COUNT(*) AS number FROM jobs WHERE state = 'QUEUED' AND attempt = 0")[0];
     ensure!(new <= MAX_JOBS as i64, "{new} new jobs wait, {MAX_JOBS} may");
     let Some(max_running) = max_running else { return Ok(()) };
-    // One that was cancelled may be stopped a little later than another begins in its place.
     let select = "SELECT CAST(substr(job, 5) AS INTEGER) AS number FROM jobs WHERE state = 'RUNNING'";
     let running = cluster.numbers(select);
     let mut of_tenant = BTreeMap::<String, BTreeSet<i64>>::new();
     for name in solving.jobs() {
         let number = name.job.trim_start_matches("job-").parse().map_err(|_| "a foreign job".to_owned())?;
+        // One that was cancelled may be stopped a little later than another begins in its place.
         if running.contains(&number) {
             of_tenant.entry(name.tenant).or_default().insert(number);
         }

@@ -29,8 +29,7 @@ use crate::geometry::planar;
 use super::Error;
 use critical::Upgrade;
 use fit::Fit;
-use options::FitOptions;
-pub use options::{CalibrationOptions, GradeOptions};
+pub use options::{CalibrationOptions, FitOptions, GradeOptions};
 use search::Search;
 
 /// A projective reconstruction to calibrate; inliers only.

@@ -1,6 +1,6 @@
 //! Whether the tracks that a reconstruction leaves out agree on motions of their own, and on which ([`motion`]).
 //!
-//! Only `assemble` depends on this; it solves parts of the input as the rest of the solver does.
+//! Only `assemble` depends on this; it solves subsets of the input as the rest of the solver does.
 
 mod motion;
 
@@ -10,6 +10,7 @@ pub use motion::describe;
 
 use super::Error;
 use super::block::Block;
+use super::calibration::FitOptions;
 use super::classification::{Geometry, Judged};
 use super::grow::{self, LEAST_INLIERS, LEAST_SUPPORT};
 use super::priors;
@@ -24,8 +25,8 @@ use crate::domain::{Method, Silent, SolveSettings, StopToken, Warning, WarningCo
 options! {
     /// What counts as a second structure, and what is said of its motion.
     pub struct SecondStructureOptions {
-        /// Searches at most, each among the tracks that are left; so many structures are reported at most. Without a
-        /// second structure the first is the last.
+        /// Searches at most, each among the tracks that are left, and structures at most. Without a second structure
+        /// the first is the last.
         most_searches: u64 = 6,
         /// Searches that may fail once a structure was found. Each of wrong tracks takes a tenth of a second.
         most_failures: u32 = 1,
@@ -35,18 +36,22 @@ options! {
         /// Evidence, at least, as a share of that of the reconstruction. Of 280 photographed scenes, drifting tracks of
         /// four had .01 to .03 in a few views; of 31 second bodies 27 had .07 and more, one .01, and three none.
         least_share: f64 = 0.05,
-        /// Tracks of a block from which it is searched only where more than four of them fit affine cameras. In smaller
-        /// blocks perspective hides that, and their search takes 10 to 20 ms; that of 190 wrong tracks took five times
-        /// as long as the rest of an easy solve.
+        /// Tracks of a block from which the first structure is searched only where more than four of them fit affine
+        /// cameras. In smaller blocks perspective hides that, and their search takes 10 to 20 ms; that of 190 wrong
+        /// tracks took five times as long as the rest of an easy solve.
         affine_check_tracks: usize = ViewSelectionOptions::DEFAULT.wanted_tracks,
         /// Triplets that are searched. Of wrong matches each takes a tenth of a second.
         most_triplets: usize = 2,
         /// Views that the plane at infinity of a structure is taken from, and planes that are refined and compared: as
-        /// many views as of the scan of a calibration; a body that is nearly a plane has two planes, and one is to spare.
+        /// many views as of the scan of a calibration; a body that is nearly a plane has two planes, and one is to
+        /// spare.
         plane_views: usize = 4,
         planes: usize = 3,
         /// Iterations of its poses and points under the calibration: those of an algebraic solution.
         iterations: usize = 30,
+        /// Root mean square of a point, in the noise of the scene, up to which it fits: that of a metric reconstruction
+        /// up to which it is used.
+        most_rms: f64 = FitOptions::DEFAULT.rms_ratio_refusal,
         /// Angle between the rays of its points, in the median, from which its poses are determined, radians: as that
         /// from which the depth of a point supports a pose. Below, it has only turned before the camera.
         least_angle: f64 = ExtensionOptions::DEFAULT.least_angle,
@@ -116,7 +121,9 @@ pub fn find(
     let mut found = Vec::new();
     let mut failures = 0;
     for search in 0..OPTIONS.most_searches {
-        let Some(next) = searched(problem, geometry, &is_left, search)? else {
+        // Of several bodies none need have most of what is left.
+        let checks_affine = found.is_empty();
+        let Some(next) = searched(problem, geometry, &is_left, search, checks_affine)? else {
             failures += 1;
             // Where there is one, another may have been missed among several: other samples may find it.
             if found.is_empty() || failures > OPTIONS.most_failures {
@@ -159,12 +166,18 @@ pub fn rival(
 /// Those of some tracks that make another projective reconstruction.
 ///
 /// * `search`: how many there were before
-fn searched(problem: &Problem, geometry: &Geometry, is_left: &[bool], search: u64) -> Result<Option<Structure>, Error> {
+/// * `checks_affine`: whether large blocks must pass a check first
+fn searched(
+    problem: &Problem,
+    geometry: &Geometry,
+    is_left: &[bool],
+    search: u64,
+    checks_affine: bool,
+) -> Result<Option<Structure>, Error> {
     if is_left.iter().filter(|is_left| **is_left).count() < LEAST_INLIERS {
         return Ok(None);
     }
-    // Of several bodies none need have most of what is left.
-    let passes = |block: &Block| search > 0 || passes_affine_check(block, problem.stop);
+    let passes = |block: &Block| !checks_affine || passes_affine_check(block, problem.stop);
     let Some((found, representative)) = reconstructed(problem, geometry, is_left, search, passes)? else {
         return Ok(None);
     };
@@ -233,6 +246,7 @@ pub fn verified(problem: &Problem, mut structures: Vec<Structure>, inlier: &[boo
     }
     structures.retain(|structure| count(structure) >= LEAST_INLIERS);
     structures.sort_by_key(|structure| Reverse(count(structure)));
+    structures.truncate(OPTIONS.most_searches as usize);
     structures
 }
 

@@ -9,6 +9,7 @@ use crate::domain::Grade;
 use crate::domain::result::{SecondStructure, SecondStructureKind, StructurePoint, StructurePose};
 use crate::geometry::Camera;
 use crate::geometry::bundle::metric::{self, Intrinsics, IntrinsicsModel, IntrinsicsPrior, MetricReconstruction, Pose};
+use crate::geometry::bundle::{Loss, Options};
 use crate::geometry::metric::{cheirality, upgrade_calibrated};
 use crate::geometry::observation::Observation;
 use crate::geometry::statistics::{CHI_SQUARE_OF_TWO, median};
@@ -43,9 +44,16 @@ pub fn describe(
     let Some((metric, observations)) = calibrated(problem, &reconstruction.geometry, found)? else {
         return Ok(unknown);
     };
-    let scene: Vec<Option<Pose>> = found.views.iter().map(|&view| reconstruction.poses[view]).collect();
+    let mut of_view = vec![0; metric.poses.len()];
+    observations.iter().for_each(|at| of_view[at.view] += 1);
+    // Fewer points do not bear a pose out.
+    let pose_in_scene =
+        |(k, view): (usize, &usize)| reconstruction.poses[*view].filter(|_| of_view[k] >= LEAST_INLIERS);
+    let scene: Vec<Option<Pose>> = found.views.iter().enumerate().map(pose_in_scene).collect();
     let mut seen = vec![0; metric.points.len()];
     observations.iter().filter(|at| scene[at.view].is_some()).for_each(|at| seen[at.point] += 1);
+    let kept: Vec<Vector3<f64>> =
+        metric.points.iter().zip(&seen).filter(|(_, seen)| **seen >= LEAST_OBSERVATIONS).map(|(at, _)| *at).collect();
     let pose = |(k, pose): (usize, &Pose)| {
         scene[k]?;
         Some(StructurePose {
@@ -60,15 +68,15 @@ pub fn describe(
     };
     Ok(SecondStructure {
         number,
-        kind: kind(&scene, &metric, reconstruction.geometry.noise),
+        kind: kind(&scene, &metric, &kept, reconstruction.geometry.noise),
         poses: metric.poses.iter().enumerate().filter_map(pose).collect(),
         points: metric.points.iter().enumerate().filter_map(point).collect(),
     })
 }
 
 /// The metric reconstruction of a structure under the calibration of the scene, in a frame and at a scale of its own,
-/// with the observations, in the image, of the points that fit; `None` where there is none that most points fit, that is
-/// in front of its cameras, has parallax and is the only one.
+/// with the observations, in the image, of the points that fit; `None` where there is none that most points fit, that
+/// is in front of its cameras, has parallax and is the only one.
 fn calibrated(
     problem: &Problem,
     geometry: &Geometry,
@@ -91,7 +99,8 @@ fn calibrated(
         let mut metric =
             MetricReconstruction { intrinsics: lenses.clone(), group_of: (0..lenses.len()).collect(), ..upgraded };
         // A wrong track may fit projective cameras that bend to it.
-        let options = GrowthOptions::METRIC.adjustment(OPTIONS.iterations, of_scene);
+        let loss = Loss::Cauchy { scale: GrowthOptions::METRIC.cauchy_scale * of_scene };
+        let options = Options { max_iterations: OPTIONS.iterations, loss, ..Options::default() };
         let report = metric::adjust(&mut metric, &observations, model, &priors, &options, problem.stop);
         (metric, report.cost)
     };
@@ -102,10 +111,11 @@ fn calibrated(
     minima.retain(|(_, cost)| cost.is_finite());
     minima.sort_by(|a, b| a.1.total_cmp(&b.1));
     let Some(((metric, cost), others)) = minima.split_first() else { return Ok(None) };
-    let kept = agreeing(metric, &observations, fit.rms_ratio_refusal * of_scene);
+    let kept = agreeing(metric, &observations, OPTIONS.most_rms * of_scene);
+    let of_kept: f64 = kept.iter().map(|seen| metric.weighted_squared(seen)).sum();
+    let unit = (of_kept / (2 * kept.len()).max(1) as f64).max(of_scene.powi(2));
     let is_rival = |(other, other_cost): &(MetricReconstruction, f64)| {
-        other_cost - cost < grades.indistinguishable * of_scene.powi(2)
-            && turned_apart(metric, other) > OPTIONS.other_poses
+        other_cost - cost < grades.indistinguishable * unit && turned_apart(metric, other) > OPTIONS.other_poses
     };
     let points = |seen: &[Observation]| seen.iter().map(|seen| seen.point).collect::<BTreeSet<_>>().len();
     let stands = 2 * points(&kept) > points(&observations)
@@ -155,8 +165,14 @@ fn ray_angles(metric: &MetricReconstruction, observations: &[Observation]) -> Ve
 ///
 /// * `scene`: the pose of each of its views in the scene
 /// * `metric`: the structure, of these views
+/// * `points`: those of its points that fit
 /// * `noise`: one standard deviation of a coordinate
-fn kind(scene: &[Option<Pose>], metric: &MetricReconstruction, noise: f64) -> Option<SecondStructureKind> {
+fn kind(
+    scene: &[Option<Pose>],
+    metric: &MetricReconstruction,
+    points: &[Vector3<f64>],
+    noise: f64,
+) -> Option<SecondStructureKind> {
     let views: Vec<(Pose, Pose, f64)> = scene
         .iter()
         .enumerate()
@@ -165,7 +181,7 @@ fn kind(scene: &[Option<Pose>], metric: &MetricReconstruction, noise: f64) -> Op
     if views.len() < LEAST_VIEWS {
         return None;
     }
-    let points = evenly(&metric.points, OPTIONS.compared_points);
+    let points = evenly(points, OPTIONS.compared_points);
     let pairs: Vec<(usize, usize)> = (0..views.len()).flat_map(|j| (0..j).map(move |i| (i, j))).collect();
     let ratio = |(i, j): (usize, usize)| ratio_of_scales(&views[i], &views[j]);
     let scales = evenly(&pairs, OPTIONS.compared_scales).into_iter().map(ratio).filter(|ratio| *ratio > 0.0);
