@@ -20,7 +20,7 @@ use crate::domain::result::{
     ObservationResults, SecondStructure, Sigmas, TrackResults, TrackSplit, TwoViewTrack, ViewResult,
 };
 use crate::domain::{Calibration, Grade, Solution, Stage, Status, Warning, WarningCode};
-use crate::geometry::bundle::metric::{Intrinsics, Parameter};
+use crate::geometry::bundle::metric::{Intrinsics, Parameter, Pose};
 use crate::geometry::daq::oriented;
 use crate::geometry::observation::Observation;
 use crate::geometry::statistics::root_mean_square;
@@ -284,8 +284,7 @@ impl Reconstruction {
             let has_own_focal = problem.has_own_focals() && pose.is_some();
             ViewResult {
                 projection: Some(std::array::from_fn(|row| std::array::from_fn(|column| projection[(row, column)]))),
-                rotation: pose
-                    .map(|pose| std::array::from_fn(|row| std::array::from_fn(|column| pose.rotation[(row, column)]))),
+                rotation: pose.map(Pose::rotation_rows),
                 translation: pose.map(|pose| pose.translation.into()),
                 focal_px: has_own_focal.then(|| self.geometry.lenses[view].focal * problem.scale_px),
                 part: self.geometry.component_of_view[view],

@@ -39,6 +39,12 @@ impl Pose {
         Self { rotation: turn * self.rotation, translation: turn * self.translation + Vector3::new(x, y, z) }
     }
 
+    /// The rotation row by row.
+    pub fn rotation_rows(&self) -> [[f64; 3]; 3] {
+        // Arrays of a matrix are its columns.
+        self.rotation.transpose().into()
+    }
+
     /// The camera matrix `K [R|t]`.
     pub fn camera(&self, intrinsics: &Intrinsics) -> Matrix3x4<f64> {
         let mut camera = Matrix3x4::zeros();

@@ -28,7 +28,8 @@ options! {
         /// Searches at most, each among the tracks that are left, and structures at most. Without a second structure
         /// the first is the last.
         most_searches: u64 = 6,
-        /// Searches that may fail once a structure was found. Each of wrong tracks takes a tenth of a second.
+        /// Searches that may fail once a structure was found: as a rule there is one body, and each costs what the first
+        /// did.
         most_failures: u32 = 1,
         /// Gates from which a track counts as left out: nearer ones are of the reconstruction, with an outlier's share
         /// of noise.
@@ -182,10 +183,10 @@ fn searched(
         return Ok(None);
     };
     let agrees = |track: usize| found.tracks.binary_search(&representative[problem.representative[track]]).is_ok();
-    let structure =
-        Structure { tracks: (0..problem.tracks()).map(agrees).collect(), reconstruction: Some(found.clone()) };
-    let stands = found.tracks.len() >= LEAST_INLIERS && structure.evidence(problem) > 0.0;
-    Ok(stands.then_some(structure))
+    let tracks = (0..problem.tracks()).map(agrees).collect();
+    let is_enough = found.tracks.len() >= LEAST_INLIERS;
+    let structure = Structure { tracks, reconstruction: Some(found) };
+    Ok(Some(structure).filter(|structure| is_enough && structure.evidence(problem) > 0.0))
 }
 
 /// A projective reconstruction of some tracks in the registered views of the largest component, behind the lenses of

@@ -2,7 +2,7 @@
 
 use std::collections::BTreeSet;
 
-use nalgebra::Vector3;
+use nalgebra::{Rotation3, Vector3};
 
 use super::{OPTIONS, Structure};
 use crate::domain::Grade;
@@ -58,7 +58,7 @@ pub fn describe(
         scene[k]?;
         Some(StructurePose {
             view: found.views[k] as u32,
-            rotation: std::array::from_fn(|row| std::array::from_fn(|column| pose.rotation[(row, column)])),
+            rotation: pose.rotation_rows(),
             translation: pose.translation.into(),
         })
     };
@@ -144,8 +144,7 @@ fn turned_apart(one: &MetricReconstruction, other: &MetricReconstruction) -> f64
         |metric: &MetricReconstruction, view: usize| metric.poses[view].rotation * metric.poses[0].rotation.transpose();
     let apart = |view: usize| {
         let turn = against_first(one, view) * against_first(other, view).transpose();
-        // The chord of an angle on the unit circle, of a rotation matrix sqrt 8 sin(angle / 2).
-        2.0 * ((turn - nalgebra::Matrix3::identity()).norm() / 8.0f64.sqrt()).min(1.0).asin()
+        Rotation3::from_matrix_unchecked(turn).angle()
     };
     (0..one.poses.len()).map(apart).fold(0.0, f64::max)
 }
@@ -173,11 +172,10 @@ fn kind(
     points: &[Vector3<f64>],
     noise: f64,
 ) -> Option<SecondStructureKind> {
-    let views: Vec<(Pose, Pose, f64)> = scene
-        .iter()
-        .enumerate()
-        .filter_map(|(k, scene)| Some(((*scene)?, metric.poses[k], metric.intrinsics_of(k).focal)))
-        .collect();
+    let view = |(k, scene): (usize, &Option<Pose>)| {
+        Some(ComparedView { scene: (*scene)?, own: metric.poses[k], focal: metric.intrinsics_of(k).focal })
+    };
+    let views: Vec<ComparedView> = scene.iter().enumerate().filter_map(view).collect();
     if views.len() < LEAST_VIEWS {
         return None;
     }
@@ -195,30 +193,32 @@ fn kind(
     })
 }
 
+/// A view with its poses in the scene and in the frame of a structure.
+struct ComparedView {
+    scene: Pose,
+    own: Pose,
+    /// Normalised.
+    focal: f64,
+}
+
 /// The scale of a structure in that of the scene at which its frame moves least between two views.
 ///
 /// At a ratio `s` the frame of the structure is in the scene at `R' (s tₛ - t)`.
-fn ratio_of_scales((scene_i, own_i, _): &(Pose, Pose, f64), (scene_j, own_j, _): &(Pose, Pose, f64)) -> f64 {
-    let own = |scene: &Pose, own: &Pose| scene.rotation.tr_mul(&own.translation);
-    let centre = |scene: &Pose| -scene.rotation.tr_mul(&scene.translation);
-    let moved = own(scene_i, own_i) - own(scene_j, own_j);
-    let moved_camera = centre(scene_i) - centre(scene_j);
+fn ratio_of_scales(first: &ComparedView, second: &ComparedView) -> f64 {
+    let own = |view: &ComparedView| view.scene.rotation.tr_mul(&view.own.translation);
+    let centre = |view: &ComparedView| -view.scene.rotation.tr_mul(&view.scene.translation);
+    let moved = own(first) - own(second);
+    let moved_camera = centre(first) - centre(second);
     -moved.dot(&moved_camera) / moved.norm_squared()
 }
 
 /// Whether most points of a structure, were they to rest in the scene where they are in the first view, would be imaged
 /// in the second as they are.
-fn rests(
-    (scene_i, own_i, _): &(Pose, Pose, f64),
-    (scene_j, own_j, focal): &(Pose, Pose, f64),
-    ratio: f64,
-    points: &[Vector3<f64>],
-    noise: f64,
-) -> bool {
-    let gate = CHI_SQUARE_OF_TWO * (noise / focal).powi(2);
+fn rests(first: &ComparedView, second: &ComparedView, ratio: f64, points: &[Vector3<f64>], noise: f64) -> bool {
+    let gate = CHI_SQUARE_OF_TWO * (noise / second.focal).powi(2);
     let agrees = |point: &&Vector3<f64>| {
-        let in_scene = scene_i.rotation.tr_mul(&(ratio * own_i.apply(point) - scene_i.translation));
-        let (at_rest, as_it_is) = (scene_j.apply(&in_scene), own_j.apply(point));
+        let in_scene = first.scene.rotation.tr_mul(&(ratio * first.own.apply(point) - first.scene.translation));
+        let (at_rest, as_it_is) = (second.scene.apply(&in_scene), second.own.apply(point));
         at_rest.z > 0.0 && (at_rest.xy() / at_rest.z - as_it_is.xy() / as_it_is.z).norm_squared() <= gate
     };
     2 * points.iter().filter(agrees).count() > points.len()
