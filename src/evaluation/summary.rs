@@ -115,17 +115,15 @@ fn cell(
         depths,
         contestant,
         seeds: pairs.len(),
-        mean_f1: mean(f1.clone()).unwrap_or(0.0),
+        mean_f1: mean(f1.iter().copied()).unwrap_or(0.0),
         least_f1: own().map(|measures| measures.f1).fold(1.0, f64::min),
-        observation_f1: mean(
-            own().filter_map(|measures| measures.observations).map(|observations| observations.f1).collect(),
-        ),
+        observation_f1: mean(own().filter_map(|measures| measures.observations).map(|observations| observations.f1)),
         reached: own().filter(|measures| measures.f1 >= REACHED_F1).count() as f64 / count,
         seconds_to_reach: median(
             own().filter(|measures| measures.f1 >= REACHED_F1).map(|measures| measures.seconds).collect(),
         ),
         solved: own().filter(|measures| measures.solved).count() as f64 / count,
-        f1_interval: bootstrap(&f1, |resampled| mean(resampled.to_vec())),
+        f1_interval: bootstrap(&f1, |resampled| mean(resampled.iter().copied())),
         error_2d_px_interval: of_median(&error_2d_px),
         error_3d_interval: of_median(&error_3d),
         focal_error_interval: of_median(&focal_error),
@@ -142,8 +140,9 @@ fn cell(
 }
 
 /// `None` without values.
-fn mean(values: Vec<f64>) -> Option<f64> {
-    (!values.is_empty()).then(|| values.iter().sum::<f64>() / values.len() as f64)
+pub fn mean(values: impl IntoIterator<Item = f64>) -> Option<f64> {
+    let (count, sum) = values.into_iter().fold((0, 0.0), |(count, sum), value| (count + 1, sum + value));
+    (count > 0).then(|| sum / f64::from(count))
 }
 
 /// Median, the mean of the two middle ones for an even number; `None` without values.

@@ -11,6 +11,7 @@ use serde::Serialize;
 use crate::domain::Grade;
 use crate::evaluation::observations::{Measured, Records, Run};
 use crate::evaluation::real::Side;
+use crate::evaluation::summary::mean;
 use crate::synthetic::PhotographedOptions;
 
 /// First seed: above those of the other evaluations.
@@ -179,10 +180,5 @@ fn carries(measured: &Measured) -> bool {
 fn deviation(measured: &Measured) -> Option<f64> {
     let squares = measured.focals.iter().map(|focal| Some((focal.log_error / focal.sigma?).powi(2)));
     let squares: Vec<f64> = squares.collect::<Option<_>>()?;
-    mean(squares.into_iter()).map(f64::sqrt)
-}
-
-fn mean(values: impl Iterator<Item = f64>) -> Option<f64> {
-    let (count, sum) = values.fold((0, 0.0), |(count, sum), value| (count + 1, sum + value));
-    (count > 0).then(|| sum / f64::from(count))
+    mean(squares).map(f64::sqrt)
 }

@@ -12,6 +12,7 @@ use scpsfm_core::evaluation::proposal::Study;
 
 use crate::domain::{Input, Limits, Proposal, Silent, SolveSettings, Status, StopToken};
 use crate::evaluation::records;
+use crate::evaluation::summary::mean;
 use crate::solver;
 use crate::statistics::median;
 use crate::synthetic::metrics::{agreement, average_precision};
@@ -225,10 +226,10 @@ fn prior_row(condition: &'static str, prior: Proposal, alone: &[&Alone]) -> Prio
         condition,
         prior,
         seeds: alone.len(),
-        average_precision: mean(&alone.iter().filter_map(|alone| alone.average_precision).collect::<Vec<_>>()),
-        f1_of_ranking: (prior == Proposal::Learned).then(|| mean(&ranking)).flatten(),
+        average_precision: mean(alone.iter().filter_map(|alone| alone.average_precision)),
+        f1_of_ranking: (prior == Proposal::Learned).then(|| mean(ranking)).flatten(),
         ranking_seconds: median(&mut alone.iter().map(|alone| alone.ranking_seconds).collect::<Vec<_>>()),
-        f1: (0..SAMPLES.len()).filter_map(|k| mean(&f1(k))).collect(),
+        f1: (0..SAMPLES.len()).filter_map(|k| mean(f1(k))).collect(),
         seconds: (0..SAMPLES.len()).map(|k| median(&mut seconds(k))).collect(),
     }
 }
@@ -241,19 +242,13 @@ fn auto_row(condition: &'static str, learned: bool, answers: &[&Answer]) -> Auto
         condition,
         learned,
         seeds: answers.len(),
-        f1: mean(&f1).unwrap_or(0.0),
+        f1: mean(f1.iter().copied()).unwrap_or(0.0),
         least_f1: f1.iter().copied().fold(f64::INFINITY, f64::min),
-        average_precision_of_ranking: mean(
-            &answers.iter().filter_map(|answer| answer.average_precision).collect::<Vec<_>>(),
-        ),
+        average_precision_of_ranking: mean(answers.iter().filter_map(|answer| answer.average_precision)),
         verified: count(|answer| answer.solved),
         ranked: count(|answer| answer.ranked),
         none: count(|answer| !answer.solved && !answer.ranked),
-        mean_seconds: mean(&seconds).unwrap_or(0.0),
+        mean_seconds: mean(seconds.iter().copied()).unwrap_or(0.0),
         median_seconds: median(&mut seconds),
     }
-}
-
-fn mean(values: &[f64]) -> Option<f64> {
-    (!values.is_empty()).then(|| values.iter().sum::<f64>() / values.len() as f64)
 }
