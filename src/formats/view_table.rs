@@ -2,6 +2,7 @@
 //! line.
 
 use std::collections::BTreeMap;
+use std::fmt::Debug;
 use std::path::Path;
 
 use csv::{ErrorKind, Position, ReaderBuilder, StringRecord, Trim};
@@ -104,20 +105,8 @@ fn check(header: &StringRecord) -> Result<(), String> {
 
 /// * `cell`: what a line has in a column; `None`: nothing
 fn put_on<'a>(view: &mut View, cell: impl Fn(&str) -> Option<&'a str>) -> Result<(), Wrong> {
-    let whole = |column: &'static str, (least, most): (u32, u32)| -> Result<Option<u32>, Wrong> {
-        let number = cell(column).map(text::whole::<u32>).transpose().map_err(|what| (column, what))?;
-        match number.filter(|number| !(least..=most).contains(number)) {
-            Some(number) => Err((column, format!("{number} is not within {least}..={most}"))),
-            None => Ok(number),
-        }
-    };
-    let real = |column: &'static str, (least, most): (f64, f64)| -> Result<Option<f64>, Wrong> {
-        let number = cell(column).map(text::number).transpose().map_err(|what| (column, what))?;
-        match number.filter(|number| !(least..=most).contains(number)) {
-            Some(number) => Err((column, format!("{number:e} is not within {least:e}..={most:e}"))),
-            None => Ok(number),
-        }
-    };
+    let whole = |column, range| within(column, cell(column).map(text::whole::<u32>), range);
+    let real = |column, range| within(column, cell(column).map(text::number), range);
     let side = |column: &'static str| whole(column, (1, ImageSize::MAX_SIDE_PX));
     match (side("width")?, side("height")?) {
         (Some(width_px), Some(height_px)) => view.size = Some(ImageSize { width_px, height_px }),
@@ -135,6 +124,20 @@ fn put_on<'a>(view: &mut View, cell: impl Fn(&str) -> Option<&'a str>) -> Result
     }
     view.camera_group = whole("camera_group", (0, u32::MAX))?.unwrap_or(view.camera_group);
     Ok(())
+}
+
+/// The number that was read in a column, of those allowed.
+fn within<T: PartialOrd + Debug>(
+    column: &'static str,
+    read: Option<Result<T, String>>,
+    (least, most): (T, T),
+) -> Result<Option<T>, Wrong> {
+    match read.transpose().map_err(|what| (column, what))? {
+        Some(number) if !(&least..=&most).contains(&&number) => {
+            Err((column, format!("{number:?} is not within {least:?}..={most:?}")))
+        }
+        number => Ok(number),
+    }
 }
 
 /// `view,camera_group,width,height`, a line for each view.
@@ -211,9 +214,9 @@ mod tests {
             ("view,camera_group\n2,1\n5,1\n2,1\n", "line 4: view: 2 is listed a second time (first on line 2)"),
             ("view,width,height\n2,800,\n", "line 2: height: is empty"),
             ("view,focal_sigma\n2,0.1\n", "line 2: focal_px: is empty"),
-            ("view,focal_px\n2,NaN\n", "line 2: focal_px: NaN is not within 1e-6..=1e9"),
-            ("view,focal_px\n2,1e300\n", "line 2: focal_px: 1e300 is not within 1e-6..=1e9"),
-            ("view,focal_px,focal_sigma\n7,2,0\n", "line 2: focal_sigma: 0e0 is not within 1e-9..=1e3"),
+            ("view,focal_px\n2,NaN\n", "line 2: focal_px: NaN is not within 1e-6..=1000000000.0"),
+            ("view,focal_px\n2,1e300\n", "line 2: focal_px: 1e300 is not within 1e-6..=1000000000.0"),
+            ("view,focal_px,focal_sigma\n7,2,0\n", "line 2: focal_sigma: 0.0 is not within 1e-9..=1000.0"),
             ("view,width,height\n2,0,3\n", "line 2: width: 0 is not within 1..=1000000"),
             ("view,camera_group\n\u{1}\u{2},1\n,1\n", "line 2: view: `"),
             ("view,camera_group\n,1\n", "line 2: view: is empty"),
