@@ -1,7 +1,7 @@
 //! A result in a few lines for people.
 
 use super::next_steps::{self, Files};
-use crate::domain::result::SecondStructureKind;
+use crate::domain::second_structure::SecondStructureKind;
 use crate::domain::{Grade, Method, Solution, Status};
 use crate::formats::result_json::{CameraGroupJson, SecondStructureCounts, camera_groups};
 use crate::formats::{LabelledInput, result_files, second_structures, warnings};
@@ -171,7 +171,7 @@ fn focal(focal_px: f64, sigma_log: Option<f64>) -> String {
 #[cfg(test)]
 mod tests {
     use super::{Files, text, text_with_files};
-    use crate::domain::result::{SecondStructure, SecondStructureKind, StructurePose};
+    use crate::domain::second_structure::{SecondStructure, SecondStructureKind, StructurePose};
     use crate::domain::{Calibration, Grade};
     use crate::formats::fixture;
 

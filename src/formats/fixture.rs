@@ -5,6 +5,7 @@ use std::path::Path;
 
 use super::{Label, LabelledInput};
 use crate::domain::result::{ObservationResults, ProposalTime, StageTime, TrackResults, TrackSplit, ViewResult};
+use crate::domain::second_structure::{SecondStructure, SecondStructureKind, StructurePoint, StructurePose};
 use crate::domain::{
     Calibration, Grade, HeadProgress, LeftOut, LensProjection, Losses, Method, Phase, Progress, Proposal,
     ReconstructionProgress, Solution, Stage, Status, Warning, WarningCode,
@@ -67,6 +68,23 @@ pub(crate) fn solved_with_a_split() -> (LabelledInput, Solution) {
     for k in (0..input.raw.x.len()).filter(of_second) {
         (solution.observations.inlier[k], solution.observations.residual_px[k]) = (false, None);
     }
+    (input, solution)
+}
+
+/// The solved scene with a moving body that has poses and a point, and a second structure without either.
+pub(crate) fn solved_with_second_structures() -> (LabelledInput, Solution) {
+    let (input, mut solution) = solved();
+    let rotation = [[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]];
+    solution.tracks.second_structure = (0..solution.tracks.inlier.len()).map(|track| [0, 1, 0, 2][track % 4]).collect();
+    solution.second_structures = vec![
+        SecondStructure {
+            number: 1,
+            kind: Some(SecondStructureKind::MovingBody),
+            poses: [0, 3].map(|view| StructurePose { view, rotation, translation: [1.0, 2.0, 3.0] }).to_vec(),
+            points: vec![StructurePoint { track: 5, point: [4.0, 5.0, 6.0] }],
+        },
+        SecondStructure { number: 2, kind: None, poses: Vec::new(), points: Vec::new() },
+    ];
     (input, solution)
 }
 

@@ -4,9 +4,7 @@ use std::fs;
 use serde_json::Value;
 
 use super::*;
-use crate::domain::result::{
-    ObservationResults, SecondStructure, SecondStructureKind, Sigmas, StructurePoint, StructurePose, TwoViewTrack,
-};
+use crate::domain::result::{ObservationResults, Sigmas, TwoViewTrack};
 use crate::domain::{Calibration, Grade, LeftOut, LensProjection, Status, Warning, WarningCode};
 use crate::formats::fixture;
 use crate::formats::manifest::Manifest;
@@ -353,57 +351,6 @@ fn tracks_of_a_second_structure_are_marked() {
     let marked: Vec<usize> = (1..lines.len()).filter(|&line| lines[line].ends_with(",1")).collect();
     assert_eq!(marked, [rejected + 1]);
     assert!(lines[1..].iter().all(|line| line.split(',').count() == 6), "{text}");
-}
-
-#[test]
-fn poses_and_points_of_second_structures_have_a_file_of_their_own() {
-    let (input, mut solution) = fixture::solved();
-    let of = |solution: &Solution| {
-        let directory = tempfile::tempdir().expect("a temporary directory");
-        write(directory.path(), solution, Some(&input), &[]).expect("written");
-        contents(directory.path())
-    };
-    let none = of(&solution);
-    assert!(!none.contains_key(SECOND_STRUCTURES));
-    assert_eq!(json(&solution)["second_structures"], Value::Array(Vec::new()));
-    solution.tracks.second_structure = (0..40).map(|track| [0, 1, 0, 2][track % 4]).collect();
-    let rotation = [[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]];
-    solution.second_structures = vec![
-        SecondStructure {
-            number: 1,
-            kind: Some(SecondStructureKind::MovingBody),
-            poses: [0, 3].map(|view| StructurePose { view, rotation, translation: [1.0, 2.0, 3.0] }).to_vec(),
-            points: vec![StructurePoint { track: 5, point: [4.0, 5.0, 6.0] }],
-        },
-        SecondStructure { number: 2, kind: None, poses: Vec::new(), points: Vec::new() },
-    ];
-    let files = of(&solution);
-    let file: Value = serde_json::from_str(&files[SECOND_STRUCTURES]).expect("JSON");
-    let structures = &file["structures"];
-    let label = |track: usize| serde_json::to_value(&input.track_labels[track]).expect("JSON");
-    let view = |view: usize| serde_json::to_value(&input.view_labels[view]).expect("JSON");
-    let tracks: Vec<Value> = (1..40).step_by(4).map(label).collect();
-    let views = [0, 3].map(|at| serde_json::json!({ "view": view(at), "R": rotation, "t": [1.0, 2.0, 3.0] }));
-    let first = serde_json::json!({
-        "number": 1,
-        "kind": "MOVING_BODY",
-        "tracks": tracks,
-        "views": views,
-        "points": [{ "track": label(5), "point": [4.0, 5.0, 6.0] }],
-    });
-    assert_eq!(structures[0], first);
-    assert_eq!(structures.as_array().map(Vec::len), Some(2));
-    assert_eq!((&structures[1]["number"], &structures[1]["kind"]), (&2.into(), &Value::Null));
-    let counts = serde_json::json!([
-        { "number": 1, "kind": "MOVING_BODY", "tracks": 10, "views": 2, "points": 1 },
-        { "number": 2, "kind": null, "tracks": 10, "views": 0, "points": 0 },
-    ]);
-    assert_eq!(json(&solution)["second_structures"], counts);
-    // It goes with the next result that has none.
-    let directory = tempfile::tempdir().expect("a temporary directory");
-    write(directory.path(), &solution, Some(&input), &[]).expect("written");
-    write(directory.path(), &fixture::solved().1, Some(&input), &[]).expect("written");
-    assert_eq!(contents(directory.path()).into_keys().collect::<Vec<_>>(), none.into_keys().collect::<Vec<_>>());
 }
 
 #[test]

@@ -2,7 +2,8 @@
 
 use serde::Serialize;
 
-use crate::domain::result::{ProposalTime, SecondStructureKind};
+use crate::domain::result::ProposalTime;
+use crate::domain::second_structure::SecondStructureKind;
 use crate::domain::{Calibration, Grade, LensProjection, Method, Solution, Status, Warning, WarningCode};
 
 use super::{Label, LabelledInput, second_structures, warnings};

@@ -6,7 +6,7 @@ use serde::Serialize;
 use super::result_json::{SecondStructureCounts, track_label, view_label};
 use super::{Label, LabelledInput};
 use crate::domain::Solution;
-use crate::domain::result::SecondStructureKind;
+use crate::domain::second_structure::SecondStructureKind;
 
 /// What `second-structures.json` holds.
 #[derive(Debug, Clone, Serialize)]
@@ -89,4 +89,59 @@ pub fn counts(solution: &Solution) -> Vec<SecondStructureCounts> {
 fn tracks(solution: &Solution, number: u32) -> impl Iterator<Item = usize> {
     let numbers = solution.tracks.second_structure.iter().enumerate();
     numbers.filter(move |(_, of)| **of == number).map(|(track, _)| track)
+}
+
+#[cfg(test)]
+mod tests {
+    use std::path::Path;
+
+    use serde_json::{Value, json};
+
+    use super::*;
+    use crate::formats::result_files::{self, SECOND_STRUCTURES};
+    use crate::formats::{LabelledInput, fixture};
+
+    fn written(directory: &Path, solution: &Solution, input: &LabelledInput) {
+        result_files::write(directory, solution, Some(input), &[]).expect("written");
+    }
+
+    #[test]
+    fn poses_and_points_have_a_file_of_their_own() {
+        let (input, solution) = fixture::solved_with_second_structures();
+        let directory = tempfile::tempdir().expect("a temporary directory");
+        written(directory.path(), &solution, &input);
+        let path = directory.path().join(SECOND_STRUCTURES);
+        let file: Value = serde_json::from_slice(&std::fs::read(&path).expect("a file")).expect("JSON");
+        let track = |track: usize| json!(input.track_labels[track]);
+        let tracks: Vec<Value> = (1..40).step_by(4).map(track).collect();
+        let rotation = [[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]];
+        let views = [0, 3].map(|at| json!({ "view": input.view_labels[at], "R": rotation, "t": [1.0, 2.0, 3.0] }));
+        let first = json!({
+            "number": 1,
+            "kind": "MOVING_BODY",
+            "tracks": tracks,
+            "views": views,
+            "points": [{ "track": track(5), "point": [4.0, 5.0, 6.0] }],
+        });
+        let tracks: Vec<Value> = (3..40).step_by(4).map(track).collect();
+        let second = json!({ "number": 2, "kind": null, "tracks": tracks, "views": [], "points": [] });
+        assert_eq!(file, json!({ "structures": [first, second] }));
+        // It goes with the next result that has none.
+        written(directory.path(), &fixture::solved().1, &input);
+        assert!(!path.exists());
+    }
+
+    #[test]
+    fn the_summary_counts_them() {
+        let counted = |solution: &Solution| {
+            let text = result_files::result_json(solution, None).expect("serialisable");
+            serde_json::from_str::<Value>(&text).expect("JSON")["second_structures"].take()
+        };
+        let counts = json!([
+            { "number": 1, "kind": "MOVING_BODY", "tracks": 10, "views": 2, "points": 1 },
+            { "number": 2, "kind": null, "tracks": 10, "views": 0, "points": 0 },
+        ]);
+        assert_eq!(counted(&fixture::solved_with_second_structures().1), counts);
+        assert_eq!(counted(&fixture::solved().1), json!([]));
+    }
 }

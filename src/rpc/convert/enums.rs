@@ -1,7 +1,7 @@
 //! Enums: the domain's and the wire's have the same variants, but for the wire's `UNSPECIFIED`.
 
 use crate::domain::job::{AttemptEnd, JobState};
-use crate::domain::result::SecondStructureKind;
+use crate::domain::second_structure::SecondStructureKind;
 use crate::domain::{
     Backend, Grade, LensProjection, Method, Phase, Proposal, Stage, Status, Task, Violation, WarningCode, WebhookState,
 };

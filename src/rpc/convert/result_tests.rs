@@ -3,7 +3,7 @@
 use prost::Message;
 
 use super::*;
-use crate::domain::result::{SecondStructure, SecondStructureKind, StructurePoint, StructurePose};
+use crate::domain::second_structure::{SecondStructure, SecondStructureKind, StructurePoint, StructurePose};
 use crate::domain::{HeadProgress, LensProjection, Losses, Phase, Progress, ReconstructionProgress};
 
 fn name() -> JobName {

@@ -3,7 +3,7 @@
 use super::enums::{Twin, optional_to_wire};
 use super::result::{in_rising_order, rows, three};
 use crate::domain::Violation;
-use crate::domain::result::{SecondStructure, SecondStructureKind, StructurePoint, StructurePose};
+use crate::domain::second_structure::{SecondStructure, SecondStructureKind, StructurePoint, StructurePose};
 use crate::rpc::proto;
 
 pub fn to_wire(structure: &SecondStructure) -> proto::SecondStructure {

@@ -14,6 +14,7 @@ pub mod limits;
 pub mod matches;
 pub mod progress;
 pub mod result;
+pub mod second_structure;
 pub mod settings;
 pub mod stop;
 pub mod warning;

@@ -16,9 +16,8 @@ use super::second_structures::{self, Structure};
 use super::sequence::Ended;
 use super::view_selection::{LEAST_SHARED_BY_PAIR, LEAST_VIEWS};
 use super::{Error, static_tracks};
-use crate::domain::result::{
-    ObservationResults, SecondStructure, Sigmas, TrackResults, TrackSplit, TwoViewTrack, ViewResult,
-};
+use crate::domain::result::{ObservationResults, Sigmas, TrackResults, TrackSplit, TwoViewTrack, ViewResult};
+use crate::domain::second_structure::SecondStructure;
 use crate::domain::{Calibration, Grade, Solution, Stage, Status, Warning, WarningCode};
 use crate::geometry::bundle::metric::{Intrinsics, Parameter, Pose};
 use crate::geometry::daq::oriented;

@@ -19,7 +19,7 @@ use super::recorder::Recorder;
 use super::search::affine::AffineSearch;
 use super::sequence::{self, Ended, ExtensionOptions, ProjectiveReconstruction};
 use super::view_selection::ViewSelectionOptions;
-use crate::domain::result::{SecondStructure, SecondStructureKind};
+use crate::domain::second_structure::{SecondStructure, SecondStructureKind};
 use crate::domain::{Method, Silent, SolveSettings, StopToken, Warning, WarningCode};
 
 options! {

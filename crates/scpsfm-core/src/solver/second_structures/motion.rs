@@ -6,7 +6,7 @@ use nalgebra::{Rotation3, Vector3};
 
 use super::{OPTIONS, Structure};
 use crate::domain::Grade;
-use crate::domain::result::{SecondStructure, SecondStructureKind, StructurePoint, StructurePose};
+use crate::domain::second_structure::{SecondStructure, SecondStructureKind, StructurePoint, StructurePose};
 use crate::geometry::Camera;
 use crate::geometry::bundle::metric::{self, Intrinsics, IntrinsicsModel, IntrinsicsPrior, MetricReconstruction, Pose};
 use crate::geometry::bundle::{Loss, Options};

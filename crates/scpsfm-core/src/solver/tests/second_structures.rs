@@ -3,7 +3,7 @@
 use nalgebra::{Matrix3, Vector3};
 
 use super::*;
-use crate::domain::result::{SecondStructure, SecondStructureKind};
+use crate::domain::second_structure::{SecondStructure, SecondStructureKind};
 use crate::evaluation::measures::{error_3d, rms_after_alignment};
 use crate::synthetic::photographed::WrongKind;
 use crate::synthetic::{Photographed, PhotographedOptions};
