@@ -1,7 +1,6 @@
 //! A result in a few lines for people.
 
 use super::next_steps::{self, Files};
-use crate::domain::second_structure::SecondStructureKind;
 use crate::domain::{Grade, Method, Solution, Status};
 use crate::formats::result_json::{CameraGroupJson, SecondStructureCounts, camera_groups};
 use crate::formats::{LabelledInput, result_files, second_structures, warnings};
@@ -140,11 +139,7 @@ fn parts(solution: &Solution) -> Option<String> {
 
 /// What is known of a second structure.
 fn structure(counts: &SecondStructureCounts) -> String {
-    let kind = match counts.kind {
-        Some(SecondStructureKind::MovingBody) => ", a moving body",
-        Some(SecondStructureKind::RepeatedStructure) => ", a repeated structure or a body that stands still at times",
-        None => "",
-    };
+    let kind = counts.kind.map_or_else(String::new, |kind| format!(", a {}", second_structures::kind_words(kind)));
     let poses = if counts.views > 0 { format!("posed in {} views", counts.views) } else { "no poses".to_owned() };
     format!("{} tracks{kind}, {poses}", counts.tracks)
 }

@@ -85,6 +85,14 @@ pub fn counts(solution: &Solution) -> Vec<SecondStructureCounts> {
     structures.collect()
 }
 
+/// The kind, as people are told it.
+pub fn kind_words(kind: SecondStructureKind) -> &'static str {
+    match kind {
+        SecondStructureKind::MovingBody => "moving body",
+        SecondStructureKind::RepeatedStructure => "repeated structure or a body that stands still at times",
+    }
+}
+
 /// Indices of the tracks of a structure, rising.
 fn tracks(solution: &Solution, number: u32) -> impl Iterator<Item = usize> {
     let numbers = solution.tracks.second_structure.iter().enumerate();

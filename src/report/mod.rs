@@ -1,6 +1,6 @@
 //! `report.html`: one self-contained page that shows a result to a person, without a network.
 //!
-//! May depend on `domain` and on the labels of `formats`. Every string is escaped on its way into the page.
+//! May depend on `domain` and on what `formats` says of results: labels, warnings, counts. Every string is escaped on its way into the page.
 
 pub mod calibration;
 pub mod chart;
@@ -11,6 +11,7 @@ pub mod labels;
 pub mod pack;
 pub mod plan;
 pub mod scene;
+pub mod second_structures;
 pub mod sections;
 pub mod space;
 pub mod splits;
@@ -51,6 +52,7 @@ pub fn page(solution: &Solution, input: Option<&LabelledInput>) -> String {
         views::parts(solution, input, &counts),
         scene::section(solution, input, &counts),
         splits::section(solution, input),
+        second_structures::section(solution),
         covisibility::section(solution, input),
         sections::convergence(solution),
         sections::weights(solution),

@@ -338,9 +338,11 @@ def down(network: Network) -> Iterator[None]:
         network.is_down = False
 
 
-def scene(folder: Path, seed: int = 0, views: int = 8, tracks: int = 120, outliers: float = 0.3) -> dict[str, Any]:
+def scene(folder: Path, seed: int = 0, views: int = 8, tracks: int = 120, outliers: float = 0.3,
+          second_motion: float = 0.0) -> dict[str, Any]:
     """A scene of the program's own generator, as a TrackSet."""
-    flags = ["--views", views, "--tracks", tracks, "--outliers", outliers, "--noise", 0.001, "--seed", seed]
+    flags = ["--views", views, "--tracks", tracks, "--outliers", outliers, "--noise", 0.001, "--seed", seed,
+             "--second-motion", second_motion]
     command = [os.environ["SCPSFM_BIN"], "synth", "--out", folder, *flags]
     subprocess.run([str(word) for word in command], check=True, stdout=subprocess.DEVNULL)
     with open(folder / "observations.csv", newline="") as file:

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+import support
 from support import CONSOLE, FILES, LONG, POLICY, Browser, Network, Server, down, until
 
 HOSTILE = '<img src=x onerror="document.title=\'taken\'">'
@@ -82,6 +83,18 @@ def test_a_job_is_seen_from_queued_to_its_result(
     until("there are curves of the events", lambda: browser.all("figure:not([hidden]) svg polyline"))
     scene_is_drawn(browser)
     assert browser.errors() == []
+
+
+def test_second_structures_are_listed(server: Server, site: str, browser: Browser, tmp_path: Path) -> None:
+    job = server.create(support.scene(tmp_path / "scene", views=10, tracks=200, outliers=0.4, second_motion=0.25))
+    open_job(browser, site, job)
+    browser.sees("Rigid motions that rejected tracks agree on", "caption")
+    result = server.call("GET", f"/v1/{job}/result")
+    (structure,) = result["secondStructures"]
+    tracks = result["tracks"]["secondStructureNumbers"].count(1)
+    row = f"1 moving body {tracks} {len(structure['poses'])} {len(structure['points'])}"
+    assert row in [row.text for row in browser.all("tbody tr")]
+    assert browser.findings() == [] and browser.errors() == []
 
 
 def picture(browser: Browser) -> str:

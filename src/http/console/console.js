@@ -29,6 +29,9 @@ const PROPOSALS = {
   NETWORK: "paper's network", IRLS: "reweighted least squares", CONSISTENCY: "consistency of motion",
   UNIFORM: "uniform sampling", RIGIDITY: "rigidity", LEARNED: "trained network",
 };
+const STRUCTURE_KINDS = {
+  MOVING_BODY: "moving body", REPEATED_STRUCTURE: "repeated structure or a body that stands still at times",
+};
 const LEFT_OUT = {
   NO_OBSERVATIONS: "no observations", OUTSIDE_BLOCK: "outside the block that was solved",
   NOT_REGISTERED: "too few points agree on a pose",
@@ -1283,6 +1286,23 @@ function calibrationTable(result) {
     : make("p", { className: "note" }, "There is no metric reconstruction, so there is no calibration.");
 }
 
+/** What is known of the rigid motions that rejected tracks agree on; nothing where there is none. */
+function structureTable(result) {
+  const structures = result.secondStructures || [];
+  const numbers = (result.tracks || {}).secondStructureNumbers || [];
+  const kind = (row) => bare(row.kind, "SECOND_STRUCTURE_KIND");
+  const columns = [
+    column("Number", (row) => String(row.number), "number"),
+    column("Kind", (row) => STRUCTURE_KINDS[kind(row)] || kind(row) || "-"),
+    column("Tracks", (row) => count(numbers.filter((number) => number === row.number).length), "number"),
+    column("Views with poses", (row) => count((row.poses || []).length), "number"),
+    column("Points", (row) => count((row.points || []).length), "number"),
+  ];
+  const title = make("h4", {}, "Second structures");
+  const caption = "Rigid motions that rejected tracks agree on";
+  return structures.length ? [title, longTable(caption, columns, structures)] : null;
+}
+
 function viewTable(views) {
   const rows = views.map((view, place) => ({ ...view, place, centre: centreOf(view) }));
   const leftOut = (row) => {
@@ -1336,7 +1356,7 @@ function resultSections(result, job) {
   return [
     make("section", { "aria-labelledby": "result-title" }, make("h3", { id: "result-title" }, "Result"),
       facts(pairs), isMore ? [make("h4", {}, "All warnings"), warningList(warnings)] : null,
-      make("h4", {}, "Cameras"), calibrationTable(result),
+      make("h4", {}, "Cameras"), calibrationTable(result), structureTable(result),
       make("details", {}, make("summary", {}, `Views (${count(views.length)})`), viewTable(views)),
       make("details", {}, make("summary", {}, "Times"), table("Time by stage", times, result.stageDurations || []))),
     sceneSection(result, views),
