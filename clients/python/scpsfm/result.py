@@ -105,6 +105,14 @@ def _row(values: Any, kind: Any, expected: int | None = None, what: str = "") ->
     return array
 
 
+def _below(values: Any, count: int, what: str) -> NDArray[np.int64]:
+    """Indices of views or tracks, of which there are `count`."""
+    array = _row(values, np.int64)
+    if array.size and int(array.max()) >= count:
+        raise InternalError(f"the result has {what} beyond its {count}", reason="INVALID_RESULT")
+    return array
+
+
 def _rows(values: Any, width: int, what: str) -> Floats:
     array = np.array([_row(row, np.float64, width, what) for row in values], dtype=np.float64).reshape(-1, width)
     array.setflags(write=False)
@@ -596,7 +604,7 @@ class Result:
     @cached_property
     def point_track_indices(self) -> NDArray[np.int64]:
         """The tracks that have a point, in rising order. (points,)."""
-        return _row(self.message.tracks.point_track_indices, np.int64)
+        return self._track_indices(self.message.tracks.point_track_indices, "a point")
 
     @cached_property
     def points(self) -> Floats:
@@ -617,8 +625,6 @@ class Result:
         message = self.message.tracks
         inlier = _row(message.inliers, np.bool_)
         count = len(inlier)
-        if len(self.point_track_indices) and int(self.point_track_indices.max()) >= count:
-            raise InternalError(f"the result has a point of a track beyond its {count}", reason="INVALID_RESULT")
         points = np.full((count, 3), np.nan)
         part = np.full(count, -1, dtype=np.int64)
         points[self.point_track_indices] = self.points
@@ -658,6 +664,7 @@ class Result:
     @cached_property
     def splits(self) -> tuple[Split, ...]:
         """The other points of tracks that join several, by track and number."""
+        self._track_indices([found.track_index for found in self.message.track_splits], "several points")
         return tuple(
             Split(
                 found.track_index,
@@ -675,7 +682,7 @@ class Result:
         points = [track.point if track.point else (np.nan,) * 3 for track in found]
         row = _row([x for point in points for x in point], np.float64, 3 * len(found), "coordinates of points")
         return TwoViewTracks(
-            track=_row([track.track_index for track in found], np.int64),
+            track=self._track_indices([track.track_index for track in found], "two views"),
             weight=_row([track.weight for track in found], np.float32),
             part=_row([track.part for track in found], np.int64),
             points=row.reshape(len(found), 3),
@@ -684,7 +691,24 @@ class Result:
     @cached_property
     def second_structures(self) -> tuple[SecondStructure, ...]:
         """The rigid motions that `SECOND_STRUCTURE` reports, by number."""
-        return tuple(_second_structure(message) for message in self.message.second_structures)
+        return tuple(self._second_structure(message) for message in self.message.second_structures)
+
+    def _second_structure(self, message: result_pb2.SecondStructure) -> SecondStructure:
+        kind = word(result_pb2.SecondStructureKind, message.kind, "SECOND_STRUCTURE_KIND_")
+        poses, points = message.poses, message.points
+        views = [pose.view_index for pose in poses]
+        return SecondStructure(
+            number=message.number,
+            kind=None if kind.startswith(("UNSPECIFIED", "UNKNOWN")) else kind,
+            view=_below(views, len(self.message.views), "a second structure of a view"),
+            R=_rows([pose.rotation for pose in poses], 9, "numbers in a rotation").reshape(len(poses), 3, 3),
+            t=_rows([pose.translation for pose in poses], 3, "numbers in a translation"),
+            track=self._track_indices([point.track_index for point in points], "a second structure"),
+            points=_rows([point.point for point in points], 3, "coordinates of a point"),
+        )
+
+    def _track_indices(self, values: Any, of: str) -> NDArray[np.int64]:
+        return _below(values, len(self.message.tracks.inliers), f"{of} of a track")
 
     def to_colmap_database(self, path: str | PathLike[str]) -> None:
         """Writes a COLMAP database of the right observations; see `scpsfm.to_colmap_database`."""
@@ -708,20 +732,6 @@ class Result:
         if self.input is None:
             raise InvalidArgument("exports need the input: result.with_tracks(tracks)", reason="NO_INPUT")
         return self.input
-
-
-def _second_structure(message: result_pb2.SecondStructure) -> SecondStructure:
-    kind = word(result_pb2.SecondStructureKind, message.kind, "SECOND_STRUCTURE_KIND_")
-    poses, points = message.poses, message.points
-    return SecondStructure(
-        number=message.number,
-        kind=None if kind.startswith(("UNSPECIFIED", "UNKNOWN")) else kind,
-        view=_row([pose.view_index for pose in poses], np.int64),
-        R=_rows([pose.rotation for pose in poses], 9, "numbers in a rotation").reshape(len(poses), 3, 3),
-        t=_rows([pose.translation for pose in poses], 3, "numbers in a translation"),
-        track=_row([point.track_index for point in points], np.int64),
-        points=_rows([point.point for point in points], 3, "coordinates of a point"),
-    )
 
 
 def _calibration(message: result_pb2.Calibration) -> Calibration:

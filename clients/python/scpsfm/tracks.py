@@ -9,6 +9,7 @@ import unicodedata
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from numbers import Real
 from os import PathLike
 from pathlib import Path
 from typing import Any, ClassVar
@@ -28,6 +29,8 @@ MAX_SIDE_PX = 1_000_000
 MAX_POSITION_PX = 1e7
 MAX_NAME_BYTES = 4096
 SIGMA_PX = (1e-4, 1e4)
+FOCAL_PX = (1e-6, 1e9)
+SIGMA_LOG = (1e-9, 1e3)
 MAX_INDEX = 2**32 - 1
 
 _CHUNK_OBSERVATIONS = 16384
@@ -39,10 +42,10 @@ class FocalPrior:
     """What is known of a focal length beforehand (EXIF, a guess of another system)."""
 
     focal_px: float
-    """In pixels, positive."""
+    """In pixels, 1e-6 to 1e9."""
 
     sigma_log: float = 0.1
-    """One standard deviation of its natural logarithm, positive. 0.1 is about ten per cent."""
+    """One standard deviation of its natural logarithm, 1e-9 to 1e3. 0.1 is about ten per cent."""
 
 
 @dataclass(frozen=True)
@@ -93,7 +96,7 @@ class Tracks:
     """One standard deviation of a coordinate of each observation, in pixels. (n,)."""
 
     depth: NDArray[np.float64] | None = None
-    """Projective depth of each observation, in any common scale. (n,)."""
+    """Projective depth of each observation, in any common scale, which may be negative; not 0. (n,)."""
 
     keypoint_index: NDArray[np.int64] | None = None
     """Which keypoint of its image each observation is. Stays with the client. (n,)."""
@@ -552,6 +555,14 @@ def _is_control(name: str) -> bool:
     return any(unicodedata.category(character) == "Cc" for character in name)
 
 
+def _is_within(value: Any, least: float, most: float) -> bool:
+    return isinstance(value, Real) and bool(least <= float(value) <= most)
+
+
+def _is_whole(value: Any, least: int, most: int) -> bool:
+    return _is_within(value, least, most) and bool(value == int(value))
+
+
 def _view_problems(views: Sequence[View]) -> Iterator[tuple[str, str]]:
     names: dict[str, int] = {}
     for index, view in enumerate(views):
@@ -559,7 +570,9 @@ def _view_problems(views: Sequence[View]) -> Iterator[tuple[str, str]]:
         if not isinstance(view, View):
             yield field, f"is {type(view).__name__}, a scpsfm.View is needed"
             continue
-        if view.name:
+        if not isinstance(view.name, str):
+            yield f"{field}.name", f"is {type(view.name).__name__}, a text is needed"
+        elif view.name:
             first = names.setdefault(view.name, index)
             if first != index:
                 yield f"{field}.name", f"{view.name!r} is the name of view {first} already"
@@ -567,17 +580,21 @@ def _view_problems(views: Sequence[View]) -> Iterator[tuple[str, str]]:
                 yield f"{field}.name", f"is longer than {MAX_NAME_BYTES} bytes"
             if _is_control(view.name):
                 yield f"{field}.name", f"{view.name!r} holds control characters"
-        if view.size is not None:
+        if view.size is not None and np.shape(view.size) != (2,):
+            yield f"{field}.size", f"{view.size!r} is not a width and a height"
+        elif view.size is not None:
             for side, what in zip(view.size, ("width", "height"), strict=True):
-                if int(side) != side or not 1 <= side <= MAX_SIDE_PX:
-                    yield f"{field}.size.{what}_px", f"{side} is not a whole number from 1 to {MAX_SIDE_PX}"
-        if int(view.camera_group) != view.camera_group or not 0 <= view.camera_group <= MAX_INDEX:
-            yield f"{field}.camera_group", f"{view.camera_group} is not a whole number from 0 to {MAX_INDEX}"
-        if view.focal_prior is not None:
-            for what in ("focal_px", "sigma_log"):
+                if not _is_whole(side, 1, MAX_SIDE_PX):
+                    yield f"{field}.size.{what}_px", f"{side!r} is not a whole number from 1 to {MAX_SIDE_PX}"
+        if not _is_whole(view.camera_group, 0, MAX_INDEX):
+            yield f"{field}.camera_group", f"{view.camera_group!r} is not a whole number from 0 to {MAX_INDEX}"
+        if isinstance(view.focal_prior, FocalPrior):
+            for what, (least, most) in (("focal_px", FOCAL_PX), ("sigma_log", SIGMA_LOG)):
                 value = getattr(view.focal_prior, what)
-                if not (np.isfinite(value) and value > 0):
-                    yield f"{field}.focal_prior.{what}", f"{value} is not a positive number"
+                if not _is_within(value, least, most):
+                    yield f"{field}.focal_prior.{what}", f"{value!r} is not a number from {least:g} to {most:g}"
+        elif view.focal_prior is not None:
+            yield f"{field}.focal_prior", f"is {type(view.focal_prior).__name__}, a scpsfm.FocalPrior is needed"
 
 
 def _check(tracks: Tracks) -> None:

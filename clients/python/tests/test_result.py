@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -198,6 +199,32 @@ def test_tracks_of_two_views_are_told(small: scene.Scene) -> None:
     message.two_view_tracks[0].point.pop()
     with pytest.raises(scpsfm.InternalError, match="coordinates of points"):
         _ = Result(message).two_view_tracks
+
+
+@pytest.mark.parametrize(
+    ("field", "add", "words"),
+    [
+        ("two_view_tracks", lambda message: message.two_view_tracks.add(track_index=120), "two views of a track"),
+        ("splits", lambda message: message.track_splits.add(track_index=120, number=1), "several points of a track"),
+        (
+            "second_structures",
+            lambda message: message.second_structures.add(number=1).points.add(track_index=120, point=[1, 2, 3]),
+            "a second structure of a track",
+        ),
+        (
+            "second_structures",
+            lambda message: message.second_structures.add(number=1).poses.add(
+                view_index=99, rotation=[0] * 9, translation=[0] * 3
+            ),
+            "a second structure of a view",
+        ),
+    ],
+)
+def test_indices_beyond_the_input_are_refused(small: scene.Scene, field: str, add: Any, words: str) -> None:
+    message = scene.true_result(small)
+    add(message)
+    with pytest.raises(scpsfm.InternalError, match=f"{words} beyond its "):
+        getattr(Result(message), field)
 
 
 def test_second_structures_are_told(small: scene.Scene) -> None:
