@@ -341,9 +341,10 @@ impl From<records::Error> for Failure {
     fn from(error: records::Error) -> Self {
         match error {
             records::Error::Io { .. } | records::Error::Failed { .. } => Failure::internal(error),
-            records::Error::OtherBuild { .. } | records::Error::Malformed { .. } | records::Error::Busy { .. } => {
-                Failure::bad_input(error)
-            }
+            records::Error::OtherBuild { .. }
+            | records::Error::Malformed { .. }
+            | records::Error::NotRecords { .. }
+            | records::Error::Busy { .. } => Failure::bad_input(error),
         }
     }
 }

@@ -27,8 +27,11 @@ pub enum Error {
         path.display()
     )]
     OtherBuild { path: PathBuf, recorded: String, current: String },
-    #[error("{} line {line}: {what}; remove the file, or give another directory", path.display())]
+    #[error("{} line {line}: {what}; remove this line, and its run is done again", path.display())]
     Malformed { path: PathBuf, line: usize, what: String },
+    /// The first line says who recorded.
+    #[error("{} line 1: {what}; remove the file, or give another directory", path.display())]
+    NotRecords { path: PathBuf, what: String },
     /// A scene that cannot be made, or a defect of the solver; the run is named.
     #[error("{run}: {what}")]
     Failed { run: String, what: String },
@@ -87,17 +90,17 @@ impl<R: Serialize + DeserializeOwned + Sync, M: Serialize + DeserializeOwned + C
         }
         let whole = whole_lines(&file).map_err(at)?;
         if let Some((first, rest)) = whole.split_first() {
-            let malformed = |line: usize, error: serde_json::Error| Error::Malformed {
-                path: path.clone(),
-                line,
-                what: error.to_string(),
-            };
-            let header: Header = serde_json::from_str(first).map_err(|error| malformed(1, error))?;
+            let header: Header = serde_json::from_slice(first)
+                .map_err(|error| Error::NotRecords { path: path.clone(), what: error.to_string() })?;
             if header.build != build {
                 return Err(Error::OtherBuild { path, recorded: header.build, current: build.to_owned() });
             }
             for (index, line) in rest.iter().enumerate() {
-                let record: Record<R, M> = serde_json::from_str(line).map_err(|error| malformed(index + 2, error))?;
+                let record: Record<R, M> = serde_json::from_slice(line).map_err(|error| Error::Malformed {
+                    path: path.clone(),
+                    line: index + 2,
+                    what: error.to_string(),
+                })?;
                 by_key.insert(key(&record.run), record.measures);
             }
         }
@@ -183,13 +186,13 @@ impl<R: Serialize + DeserializeOwned + Sync, M: Serialize + DeserializeOwned + C
 }
 
 /// The lines of a file that end, without their ends.
-fn whole_lines(file: &File) -> std::io::Result<Vec<String>> {
+fn whole_lines(file: &File) -> std::io::Result<Vec<Vec<u8>>> {
     let mut reader = BufReader::new(file);
     let mut lines = Vec::new();
     loop {
-        let mut line = String::new();
-        reader.read_line(&mut line)?;
-        if line.pop() != Some('\n') {
+        let mut line = Vec::new();
+        reader.read_until(b'\n', &mut line)?;
+        if line.pop() != Some(b'\n') {
             return Ok(lines);
         }
         lines.push(line);

@@ -82,13 +82,17 @@ mod tests {
         let other = Records::open(directory.path(), RECORDS, "another build");
         assert!(matches!(other, Err(Error::OtherBuild { .. })));
         let path = directory.path().join(RECORDS);
-        let mut text = std::fs::read_to_string(&path).expect("records");
-        text.push_str("{\"scene\": 3}\n");
-        std::fs::write(&path, text).expect("writable");
-        let Err(Error::Malformed { line, .. }) = Records::open(directory.path(), RECORDS, "a build") else {
-            panic!("garbage was accepted")
-        };
-        assert_eq!(line, 4);
+        let records = std::fs::read(&path).expect("records");
+        for garbage in [&b"{\"scene\": 3}\n"[..], b"\xff\n"] {
+            std::fs::write(&path, [&records, garbage].concat()).expect("writable");
+            let refused = Records::open(directory.path(), RECORDS, "a build").err().expect("garbage").to_string();
+            assert!(refused.contains("line 4: ") && refused.contains("remove this line"), "{refused}");
+        }
+        std::fs::write(&path, &records).expect("writable");
+        assert_eq!(run_all(directory.path(), 1), 0);
+        std::fs::write(&path, "a list of mine\n").expect("writable");
+        let refused = Records::open(directory.path(), RECORDS, "a build").err().expect("garbage").to_string();
+        assert!(refused.contains("line 1: ") && refused.contains("remove the file"), "{refused}");
     }
 
     #[test]
