@@ -35,7 +35,10 @@ const REMEDIES: [(WarningCode, &str); 15] = [
         "add views or longer tracks; until then the weights of tracks.csv are a ranking only",
     ),
     (WarningCode::FewInliers, "add tracks that three views or more share: more features, or photos with more overlap"),
-    (WarningCode::NoConsensus, "check the matches and the order of the views; add longer tracks"),
+    (
+        WarningCode::NoConsensus,
+        "check the matches and the order of the views; add views, and tracks that three or more share",
+    ),
     (
         WarningCode::CameraGroupsMerged,
         "make each camera a group of its own (--view-table), and use --method auto or geometry",
