@@ -128,7 +128,8 @@ fn a_blank_line_does_not_shift_the_lines_of_errors() {
 #[test]
 fn bad_depths_are_named_too() {
     let with = |depth: &str| bad(format!("view,track,x,y,depth\n0,0,1,2,1\n1,0,1,2,{depth}\n"));
-    assert!(with("0")[0].starts_with("dir/observations.csv, line 3: depth: 0 is not"), "{:?}", with("0"));
+    assert!(with("0")[0].starts_with("dir/observations.csv, line 3: depth: 0.0 is not"), "{:?}", with("0"));
+    assert!(with("1e300")[0].contains(": depth: 1e300 is not"), "{:?}", with("1e300"));
     assert!(with("")[0].starts_with("dir/observations.csv, line 3: depth: is empty"), "{:?}", with(""));
 }
 

@@ -396,14 +396,14 @@ fn check_observations(raw: &RawInput, field: &impl Fn(&str) -> String, found: &m
             found.push(Violation::at(
                 field("depths"),
                 k,
-                format!("{depth} is not of a size within {least:e}..={most:e}; leave an unobserved point out"),
+                format!("{depth:?} is not of a size within {least:e}..={most:e}; leave an unobserved point out"),
             ));
         }
         let (least, most) = Input::SIGMA_RANGE;
         if let Some(sigma) = raw.sigma.get(k)
             && !(least..=most).contains(sigma)
         {
-            let what = format!("{sigma} px is no standard deviation within {least:e}..={most:e} px");
+            let what = format!("{sigma:?} px is no standard deviation within {least:e}..={most:e} px");
             found.push(Violation::at(field("sigmas_px"), k, what));
         }
     }
