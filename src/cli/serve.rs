@@ -56,7 +56,7 @@ pub struct Args {
     #[arg(long, value_name = "ADDRESS")]
     pub http_listen: Option<String>,
 
-    /// Address of /metrics, /healthz and /readyz [default: 127.0.0.1:9464]
+    /// Address of /metrics, /healthz and /readyz; always open, port 0 takes a free one [default: 127.0.0.1:9464]
     #[arg(long, value_name = "ADDRESS")]
     pub metrics_listen: Option<String>,
 
