@@ -14,7 +14,8 @@ Exit codes:
     2  wrong usage
     3  no reconstruction: the result files were written and say why
    64  bad configuration
-   65  bad input data, or more than the server ever takes; no such job
+   65  bad input data, or more than the server ever takes; no such job, or one whose state does not allow the call,
+       such as `result` before it has ended
    69  server unavailable or its queue full: try again
    77  not let in: no API key, an unknown one, one whose scope does not allow the call, or a certificate that one side
        does not trust

@@ -29,8 +29,8 @@ pub struct Args {
     #[command(flatten)]
     pub server: ServerArgs,
 
-    /// The file that the job was submitted with, for its ids and the files that need its points; with the flags of the
-    /// submission that say how to read it
+    /// The file that the job was submitted with, for its ids and the files that need its points. What the submission
+    /// said of it is needed again: --width, --height, --format, --matches, --focal-px, --focal-sigma, --view-table
     #[arg(long, value_name = "INPUT", requires = "out")]
     pub input: Option<PathBuf>,
 
