@@ -279,6 +279,32 @@ mod tests {
     }
 
     #[test]
+    fn every_field_of_the_truth_is_documented() {
+        let documented = include_str!("../../docs/results.md").split("## `truth.json`").nth(1).expect("a section");
+        let documented = documented.split("\n## ").next().expect("its text");
+        let photographed = Photographed::generate(&PhotographedOptions::drawn(5)).expect("valid options");
+        let sequence = Sequence::generate(&SequenceOptions::default()).expect("valid options");
+        let scene = args(Path::new("out"), &[]).generate().expect("valid options");
+        let directory = tempfile::tempdir().expect("a temporary directory");
+        let out = directory.path();
+        for (name, written) in [
+            ("scene", write_scene(&out.join("scene"), &scene)),
+            ("walk", write(&out.join("walk"), SQUARE, &sequence.input, &sequence.options, &sequence.truth)),
+            (
+                "photos",
+                write(&out.join("photos"), SQUARE, &photographed.input, &photographed.options, &photographed.truth),
+            ),
+        ] {
+            written.expect("written");
+            let text = std::fs::read(out.join(name).join(TRUTH)).expect("truth.json");
+            let truth: serde_json::Value = serde_json::from_slice(&text).expect("JSON");
+            for field in truth.as_object().expect("an object").keys() {
+                assert!(documented.contains(&format!("`{field}`")), "{name}: {field}");
+            }
+        }
+    }
+
+    #[test]
     fn without_more_arguments_the_scene_is_the_papers() {
         let options = args(Path::new("out"), &[]).generate().expect("valid options").options;
         let paper = SceneOptions { views: 4, tracks: 30, outliers: 0.5, seed: 11, ..SceneOptions::default() };
@@ -317,6 +343,7 @@ mod tests {
         assert_eq!(failure.exit, Exit::Usage);
         assert!(failure.message.contains("noise"), "{failure}");
     }
+
     #[test]
     fn a_photographed_scene_is_written_and_its_choices_are_the_seeds() {
         #[derive(Debug, clap::Parser)]
