@@ -4,7 +4,6 @@ use std::collections::BTreeSet;
 use std::path::{Path, PathBuf};
 
 use clap::ValueEnum;
-use indicatif::{ProgressBar, ProgressStyle};
 use serde_json::json;
 use sha2::{Digest, Sha256};
 
@@ -19,6 +18,7 @@ use super::exit::{self, Exit, Failure};
 use super::interrupt::Interrupt;
 use super::print;
 use super::prior_file::PriorFileArgs;
+use super::progress::RunsView;
 use crate::domain::{Sha256Digest, SolveSettings, StopToken};
 use crate::evaluation::plan::{Contestant, Depths, Plan};
 use crate::evaluation::records;
@@ -34,6 +34,9 @@ const QUICK_SEEDS: u64 = 4;
 /// too.
 const QUICK_OBSERVATIONS: usize = 5_000;
 
+/// What an interrupted evaluation says.
+pub(super) const GOES_ON: &str = "interrupted; called again with the same --out it goes on";
+
 const EXAMPLES: &str = "\
 Examples:
   scpsfm evaluate --quick
@@ -45,7 +48,7 @@ Examples:
   scpsfm evaluate --priors --seeds 20 --out priors
   scpsfm evaluate --observations --scenes complete --out observations
   scpsfm evaluate --photographed --seeds 40 --scenes fisheye --out photographed
-  scpsfm evaluate --long --scenes drive --out long
+  scpsfm evaluate --long --scenes drive,corridor --out long
   scpsfm evaluate --real sequences --peer 'python peer.py' --out side-by-side
 
 Files in the output directory: runs.jsonl (every run, one a line), summary.csv and summary.json (one entry a cell), \
@@ -203,25 +206,22 @@ pub async fn run(args: Args) -> Result<Exit, Failure> {
     args.prior.install()?;
     let threads = args.threads.map_or_else(cores, usize::from);
     let seeds = args.seeds.unwrap_or(SEEDS);
+    let work = Work { out: &args.out, threads, quiet: args.quiet, json: args.json };
+    let scenes = args.priors.texts();
     if args.observations.observations {
-        let work = Work { out: &args.out, threads, quiet: args.quiet };
-        let (scenes, peer) = (args.priors.scenes.as_deref(), args.real.peer_words()?);
-        return evaluate_observations::run(scenes, seeds, peer, &work, args.json);
+        return evaluate_observations::run(&scenes, seeds, args.real.peer_words()?, &work);
     }
     if args.photographed.photographed {
-        let work = Work { out: &args.out, threads, quiet: args.quiet };
-        let (scenes, peer) = (args.priors.scenes.as_deref(), args.real.peer_words()?);
         let seeds = args.seeds.unwrap_or(evaluate_photographed::SEEDS);
-        return evaluate_photographed::run(scenes, seeds, peer, &work, args.json);
+        return evaluate_photographed::run(&scenes, seeds, args.real.peer_words()?, &work);
     }
     if args.long.long {
         // One after the other: the memory is that of one solve.
-        let work = Work { out: &args.out, threads: 1, quiet: args.quiet };
         let seeds = args.seeds.unwrap_or(evaluate_long::SEEDS);
-        return evaluate_long::run(args.priors.scenes.as_deref(), seeds, &work, args.json);
+        return evaluate_long::run(&scenes, seeds, &Work { threads: 1, ..work });
     }
     if args.priors.priors {
-        return evaluate_priors::run(&args.priors, &args.out, seeds, threads, args.json, args.quiet).await;
+        return evaluate_priors::run(&args.priors, seeds, &work);
     }
     let plan = args.plan();
     let runs = plan.runs();
@@ -231,14 +231,14 @@ pub async fn run(args: Args) -> Result<Exit, Failure> {
     create_directory(&args.out)?;
     let mut records = Records::open(&args.out, runner::RECORDS, &build()?)?;
     let missing = runs.iter().filter(|run| records.get(run).is_none()).count();
-    let bar = progress_bar(args.quiet, runs.len(), runs.len() - missing);
+    let bar = RunsView::new(args.quiet, runs.len(), runs.len() - missing);
     let stop = StopToken::default();
     let interrupt = Interrupt::listen()?;
     let relay = interrupt.stops(&stop);
     let outcome = tokio::task::block_in_place(|| {
         records.run(&runs, threads, &stop, &|run| runner::measure(run, &stop), &mut |run| {
             let scene = &run.scene;
-            bar.set_message(format!(
+            bar.show(format!(
                 "{}: {} views, {} tracks, {} outliers, {} noise",
                 run.contestant.name(),
                 scene.views,
@@ -246,17 +246,17 @@ pub async fn run(args: Args) -> Result<Exit, Failure> {
                 scene.outliers,
                 scene.noise
             ));
-            bar.inc(1);
+            bar.finished();
         })
     });
     relay.abort();
-    bar.finish_and_clear();
+    bar.finish();
     outcome?;
     let cells = summary::cells(&plan, &records);
     let summary = write_summary(&args.out, &plan, &records, &cells)?;
     print(if args.json { summary.trim_end().to_owned() } else { table(&cells) }.trim_end())?;
     if stop.is_stopped() {
-        return Err(Failure::interrupted_with("interrupted; called again with the same --out it goes on"));
+        return Err(Failure::interrupted_with(GOES_ON));
     }
     Ok(Exit::Done)
 }
@@ -322,19 +322,6 @@ pub(super) fn build() -> Result<String, Failure> {
     // Another network gives other figures.
     let network = scpsfm_core::subspace::current_sha256();
     Ok(format!("{} {program:.16} {network:.16}", env!("CARGO_PKG_VERSION")))
-}
-
-pub(super) fn progress_bar(quiet: bool, total: usize, done: usize) -> ProgressBar {
-    if quiet {
-        return ProgressBar::hidden();
-    }
-    let bar = ProgressBar::new(total as u64);
-    if let Ok(style) = ProgressStyle::with_template("[{bar:24}] {pos}/{len} runs, {eta} left  {wide_msg}") {
-        bar.set_style(style.progress_chars("=> "));
-    }
-    bar.set_position(done as u64);
-    bar.reset_eta();
-    bar
 }
 
 impl From<records::Error> for Failure {

@@ -2,11 +2,9 @@
 
 use serde_json::json;
 
-use super::evaluate_priors::{self, Work, chosen};
+use super::evaluate_priors::{Work, chosen};
 use super::exit::{Exit, Failure};
-use super::print;
 use crate::evaluation::observations::{self, Plan, conditions, table};
-use crate::formats::publish::create_directory;
 
 /// Wrong observations in right tracks instead of the sweeps.
 #[derive(Debug, Clone, clap::Args)]
@@ -20,16 +18,11 @@ pub struct ObservationArgs {
     pub observations: bool,
 }
 
-/// Runs the command on the inputs of this name.
-pub fn run(scenes: Option<&str>, seeds: u64, peer: Vec<String>, work: &Work, json: bool) -> Result<Exit, Failure> {
+/// Runs the command on the inputs of these names.
+pub fn run(scenes: &[&str], seeds: u64, peer: Vec<String>, work: &Work) -> Result<Exit, Failure> {
     let plan = Plan { conditions: chosen(conditions::all(), |condition| &condition.name, scenes)?, seeds, peer };
-    create_directory(work.out)?;
-    let records = work.run(observations::RECORDS, &plan.runs(), observations::measure, |records| {
-        print(table::text(&plan.rows(records)).trim_end())
-    })?;
-    let rows = plan.rows(&records);
-    let text = json!({ "seeds": plan.seeds, "peer": plan.peer, "rows": rows });
-    let text = evaluate_priors::written(work.out, "observations.json", text)?;
-    print(if json { text.trim_end().to_owned() } else { table::text(&rows) }.trim_end())?;
-    Ok(Exit::Done)
+    work.run(observations::RECORDS, &plan.runs(), observations::measure, "observations.json", |records| {
+        let rows = plan.rows(records);
+        (json!({ "seeds": plan.seeds, "peer": plan.peer, "rows": rows }), table::text(&rows))
+    })
 }

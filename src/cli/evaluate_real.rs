@@ -3,18 +3,15 @@
 use std::path::PathBuf;
 use std::time::Duration;
 
-use indicatif::{ProgressBar, ProgressStyle};
 use serde_json::json;
 
 use super::exit::{Exit, Failure};
 use super::interrupt::Interrupt;
 use super::print;
+use super::progress::RunsView;
 use crate::domain::StopToken;
 use crate::evaluation::real::{self, Options, Row, Sequence, folder, page, table};
 use crate::formats::publish::{create_directory, pretty, write_atomically};
-
-/// How often the progress shows that something still runs.
-const TICK: Duration = Duration::from_millis(200);
 
 /// What the files of a sequence must hold.
 pub const FORMAT: &str = "\
@@ -78,7 +75,7 @@ pub async fn run(args: &RealArgs, out: &std::path::Path, json: bool, quiet: bool
     let program = std::env::current_exe()?;
     let options = Options { program, peer, peer_timeout: Duration::from_secs(args.peer_timeout) };
     let sides = if options.peer.is_empty() { 1 } else { 2 };
-    let bar = progress_bar(quiet, sides * sequences.len());
+    let bar = RunsView::new(quiet, sides * sequences.len(), 0);
     let stop = StopToken::default();
     let interrupt = Interrupt::listen()?;
     let relay = interrupt.stops(&stop);
@@ -87,12 +84,12 @@ pub async fn run(args: &RealArgs, out: &std::path::Path, json: bool, quiet: bool
             &sequences,
             &options,
             &stop,
-            &mut |sequence, side| bar.set_message(format!("{}: {}", sequence.name, side.name())),
-            &mut |_| bar.inc(1),
+            &mut |sequence, side| bar.show(format!("{}: {}", sequence.name, side.name())),
+            &mut |_| bar.finished(),
         )
     });
     relay.abort();
-    bar.finish_and_clear();
+    bar.finish();
     let rows = outcome.map_err(Failure::internal)?;
     let text = write(out, &rows, &options)?;
     print(if json { text.trim_end().to_owned() } else { table::text(&rows) }.trim_end())?;
@@ -113,18 +110,6 @@ fn write(out: &std::path::Path, rows: &[Row], options: &Options) -> Result<Strin
     write_atomically(out, "real.csv", table::csv(rows).as_bytes())?;
     write_atomically(out, "real.html", page::page(rows, &options.peer).as_bytes())?;
     Ok(text)
-}
-
-fn progress_bar(quiet: bool, total: usize) -> ProgressBar {
-    if quiet {
-        return ProgressBar::hidden();
-    }
-    let bar = ProgressBar::new(total as u64);
-    if let Ok(style) = ProgressStyle::with_template("[{bar:24}] {pos}/{len} runs, {elapsed}  {wide_msg}") {
-        bar.set_style(style.progress_chars("=> "));
-    }
-    bar.enable_steady_tick(TICK);
-    bar
 }
 
 impl From<real::Error> for Failure {

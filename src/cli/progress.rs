@@ -1,6 +1,8 @@
 //! Showing how far a job is: a bar on a terminal, a few plain lines elsewhere. Always on stderr.
 
+use std::cell::Cell;
 use std::io::IsTerminal;
+use std::time::{Duration, Instant};
 
 use indicatif::{ProgressBar, ProgressStyle};
 
@@ -14,6 +16,12 @@ const LINE_EVERY_SHARE: f64 = 0.1;
 const LINE_EVERY_SECONDS: f64 = 0.2;
 /// ... but not before this share of the time already spent: short jobs show that they live, hour-long ones fill no log.
 const LINE_EVERY_SPENT: f64 = 0.1;
+
+/// How often the bar of an evaluation shows that something still runs.
+const TICK: Duration = Duration::from_millis(200);
+
+/// Between two lines of an evaluation: runs of milliseconds fill no log.
+const LINE_EVERY: Duration = Duration::from_secs(1);
 
 /// Shows progress; nothing when quiet.
 pub struct ProgressView {
@@ -133,6 +141,53 @@ impl TransferView {
 impl Drop for TransferView {
     fn drop(&mut self) {
         self.finish();
+    }
+}
+
+/// Shows how many runs are done: a bar on a terminal, a line for each run that takes its time elsewhere.
+pub struct RunsView {
+    bar: ProgressBar,
+    has_lines: bool,
+    last_line: Cell<Option<Instant>>,
+}
+
+impl RunsView {
+    pub fn new(quiet: bool, total: usize, done: usize) -> Self {
+        let has_bar = !quiet && std::io::stderr().is_terminal();
+        let bar = if has_bar { ProgressBar::new(total as u64) } else { ProgressBar::hidden() };
+        bar.set_length(total as u64);
+        if let Ok(style) = ProgressStyle::with_template("[{bar:24}] {pos}/{len} runs, {eta} left  {wide_msg}") {
+            bar.set_style(style.progress_chars("=> "));
+        }
+        bar.set_position(done as u64);
+        bar.reset_eta();
+        if has_bar {
+            bar.enable_steady_tick(TICK);
+        }
+        Self { bar, has_lines: !quiet && !has_bar, last_line: Cell::new(None) }
+    }
+
+    /// A run begins, or ended.
+    pub fn show(&self, what: String) {
+        self.bar.set_message(what);
+    }
+
+    /// One more run is done.
+    pub fn finished(&self) {
+        self.bar.inc(1);
+        let (done, total) = (self.bar.position(), self.bar.length().unwrap_or_default());
+        let is_due = done == total || self.last_line.get().is_none_or(|at| at.elapsed() >= LINE_EVERY);
+        if self.has_lines && is_due {
+            self.last_line.set(Some(Instant::now()));
+            let line =
+                format!("{done}/{total} runs, {:.0} s  {}", self.bar.elapsed().as_secs_f64(), self.bar.message());
+            tell!("{}", line.trim_end());
+        }
+    }
+
+    /// Takes the bar away.
+    pub fn finish(&self) {
+        self.bar.finish_and_clear();
     }
 }
 

@@ -1,11 +1,14 @@
 //! The trained network from the shell: training, its files, asking another one.
 
 use std::fs;
+use std::io::{BufRead, BufReader, Read};
 use std::path::Path;
+use std::process::Stdio;
 
+use rustix::process::Signal;
 use serde_json::Value;
 
-use crate::support::program::{Run, run};
+use crate::support::program::{Run, Running, program, run};
 
 fn text(path: &Path) -> &str {
     path.to_str().expect("a path of ours")
@@ -111,4 +114,26 @@ fn priors_are_compared_in_a_table_and_a_file() {
     assert_eq!(lines(), 2);
     let unknown = run_of("no such scenes");
     assert!(unknown.code == Some(2) && unknown.stderr.contains("outliers .9"), "{unknown:?}");
+}
+
+/// Several scenes make a list, each run has a line where stderr is no terminal, and what was asked for as JSON is JSON.
+#[test]
+fn an_interrupted_comparison_prints_json() {
+    let directory = tempfile::tempdir().expect("a temporary directory");
+    let scenes = ["--scenes", "outliers .9,any roll, .97", "--seeds", "1000"];
+    let how = ["--threads", "1", "--json", "--out", text(directory.path())];
+    let mut command = program(["evaluate", "--priors", "--auto-only"].iter().chain(&scenes).chain(&how));
+    let mut running = Running(command.stdout(Stdio::piped()).stderr(Stdio::piped()).spawn().expect("started"));
+    let mut lines = BufReader::new(running.0.stderr.take().expect("stderr")).lines();
+    let first = lines.next().expect("a line").expect("text");
+    assert!(first.starts_with("1/2000 runs, "), "{first}");
+    running.signal(Signal::INT);
+    let mut stdout = String::new();
+    running.0.stdout.take().expect("stdout").read_to_string(&mut stdout).expect("text");
+    assert_eq!(running.wait().code(), Some(130), "{stdout}");
+    let printed: Value = serde_json::from_str(&stdout).expect("JSON");
+    let rows = printed["rows"]["auto"].as_array().expect("rows");
+    assert!(rows.iter().any(|row| row["condition"] == "outliers .9"), "{printed}");
+    let written = fs::read_to_string(directory.path().join("priors.json")).expect("priors.json");
+    assert_eq!(written.trim_end(), stdout.trim_end());
 }

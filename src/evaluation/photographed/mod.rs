@@ -48,15 +48,11 @@ pub struct Plan {
 }
 
 impl Plan {
-    /// The scenes of so many seeds, of these the ones whose name holds a text.
-    pub fn new(seeds: u64, text: Option<&str>, peer: Vec<String>) -> Self {
+    /// The scenes of so many seeds, of these the ones whose name holds one of the texts; without a text all.
+    pub fn new(seeds: u64, texts: &[&str], peer: Vec<String>) -> Self {
         let scenes = (FIRST_SEED..FIRST_SEED + seeds).map(PhotographedOptions::drawn);
-        Self { scenes: scenes.filter(|options| text.is_none_or(|text| options.name().contains(text))).collect(), peer }
-    }
-
-    /// Number of scenes.
-    pub fn scene_count(&self) -> usize {
-        self.scenes.len()
+        let is_wanted = |name: &str| texts.is_empty() || texts.iter().any(|text| name.contains(text));
+        Self { scenes: scenes.filter(|options| is_wanted(&options.name())).collect(), peer }
     }
 
     /// Their names.

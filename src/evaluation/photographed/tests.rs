@@ -43,10 +43,12 @@ fn a_row_tells_refused_from_impossible_and_belied_from_covered() {
 #[test]
 fn a_text_chooses_scenes_and_peers_get_those_of_one_camera() {
     let peer = vec!["peer".to_owned()];
-    let plan = Plan::new(60, None, peer.clone());
-    assert_eq!((plan.scene_count(), plan.runs().len()), (60, 60 + 20));
-    let chosen = Plan::new(60, Some("fisheye"), Vec::new());
-    assert!((7..=9).contains(&chosen.scene_count()), "{}", chosen.scene_count());
-    assert_eq!(chosen.runs().len(), chosen.scene_count());
-    assert_eq!(Plan::new(60, Some("no such scene"), peer).scene_count(), 0);
+    let plan = Plan::new(60, &[], peer.clone());
+    assert_eq!((plan.names().len(), plan.runs().len()), (60, 60 + 20));
+    let chosen = Plan::new(60, &["fisheye"], Vec::new());
+    assert!((7..=9).contains(&chosen.names().len()), "{}", chosen.names().len());
+    assert_eq!(chosen.runs().len(), chosen.names().len());
+    let several = Plan::new(60, &["fisheye", "barrel"], Vec::new()).names();
+    assert!(several.len() > chosen.names().len() && several.iter().any(|name| name.contains("barrel")), "{several:?}");
+    assert!(Plan::new(60, &["no such scene"], peer).names().is_empty());
 }
