@@ -42,16 +42,17 @@ pub fn text(solution: &Solution, input: Option<&LabelledInput>) -> String {
             solution.inlier_observation_count()
         ),
     );
+    let two_views = solution.two_view_tracks.len();
+    if two_views > 0 {
+        let what = "tracks that two views of a part see are consistent with these; none is verified";
+        fact("two views", format!("{two_views} {what}"));
+    }
     match input.map_or(0, |input| unclassified(solution, input)) {
         0 => {}
-        count => fact("unclassified", format!("{count} tracks: fewer than {VERIFIED} registered views see them")),
-    }
-    if !solution.two_view_tracks.is_empty() {
-        let count = solution.two_view_tracks.len();
-        fact(
-            "two views",
-            format!("{count} tracks that two views of a part see are consistent with these; none is verified"),
-        );
+        count => {
+            let tracks = if two_views > 0 { "other tracks" } else { "tracks" };
+            fact("unclassified", format!("{count} {tracks}: fewer than {VERIFIED} registered views see them"));
+        }
     }
     for counts in second_structures::counts(solution) {
         fact(&format!("structure {} ", counts.number), structure(&counts));
@@ -83,7 +84,8 @@ pub fn text(solution: &Solution, input: Option<&LabelledInput>) -> String {
     lines.join("\n")
 }
 
-/// Tracks that nothing is said of, as too few registered views see them; of a method that judges observations.
+/// Tracks that nothing is said of, as too few registered views see them; of a method that judges observations. Those
+/// that are consistent with two views are none of them.
 fn unclassified(solution: &Solution, input: &LabelledInput) -> usize {
     if solution.status != Status::Solved || !matches!(solution.method, Method::Auto | Method::Geometry) {
         return 0;
@@ -91,6 +93,9 @@ fn unclassified(solution: &Solution, input: &LabelledInput) -> usize {
     let mut seen = vec![0usize; solution.tracks.inlier.len()];
     for (&view, &track) in input.raw.view.iter().zip(&input.raw.track) {
         seen[track as usize] += usize::from(solution.views[view as usize].projection.is_some());
+    }
+    for track in &solution.two_view_tracks {
+        seen[track.track as usize] = VERIFIED;
     }
     seen.into_iter().filter(|&count| count < VERIFIED).count()
 }
@@ -166,6 +171,7 @@ fn focal(focal_px: f64, sigma_log: Option<f64>) -> String {
 #[cfg(test)]
 mod tests {
     use super::{Files, text, text_with_files};
+    use crate::domain::result::TwoViewTrack;
     use crate::domain::second_structure::{SecondStructure, SecondStructureKind, StructurePose};
     use crate::domain::{Calibration, Grade};
     use crate::formats::fixture;
@@ -190,6 +196,10 @@ mod tests {
         solution.views[..3].iter_mut().for_each(|view| view.projection = None);
         let lines = text(&solution, Some(&input));
         assert!(lines.contains("unclassified 40 tracks: fewer than 3 registered views see them"), "{lines}");
+        solution.two_view_tracks = vec![TwoViewTrack { track: 7, weight: 0.75, part: 0, point: None }];
+        let lines = text(&solution, Some(&input));
+        assert!(lines.contains("two views    1 tracks that two views of a part see"), "{lines}");
+        assert!(lines.contains("unclassified 39 other tracks: fewer than 3 registered views see them"), "{lines}");
     }
 
     #[test]
