@@ -16,37 +16,31 @@ use opentelemetry::metrics::{AsyncInstrument, Meter};
 use super::catalogue::{ALL, Kind, Metric, TENANT_JOBS};
 use super::{process, tenants};
 
-/// Counters and gauges, by name and labels.
+/// Counters or gauges of one metric, by labels.
 type Series = Registry<Key, AtomicStorage>;
 
 /// Records what a meter exports.
 pub(super) struct OtlpRecorder {
-    series: Arc<Series>,
+    series: HashMap<&'static str, Arc<Series>>,
     histograms: HashMap<&'static str, opentelemetry::metrics::Histogram<f64>>,
 }
 
 impl OtlpRecorder {
     /// A recorder of the metrics of the catalogue, with its help texts and buckets.
     pub(super) fn new(meter: &Meter) -> Self {
-        let series = Arc::new(Series::atomic());
-        let mut histograms = HashMap::new();
+        let (mut series, mut histograms) = (HashMap::new(), HashMap::new());
         for metric in ALL {
-            let series = series.clone();
             match metric.kind {
-                Kind::Counter => drop(
-                    meter
-                        .u64_observable_counter(metric.name)
-                        .with_description(metric.help)
-                        .with_callback(move |observer| observe_counter(metric, &series, observer))
-                        .build(),
-                ),
-                Kind::Gauge => drop(
-                    meter
-                        .f64_observable_gauge(metric.name)
-                        .with_description(metric.help)
-                        .with_callback(move |observer| observe_gauge(metric, &series, observer))
-                        .build(),
-                ),
+                Kind::Counter => {
+                    let callback = counter_callback(metric, series.entry(metric.name).or_insert_with(new_series));
+                    let counter = meter.u64_observable_counter(metric.name).with_description(metric.help);
+                    counter.with_callback(callback).build();
+                }
+                Kind::Gauge => {
+                    let callback = gauge_callback(metric, series.entry(metric.name).or_insert_with(new_series));
+                    let gauge = meter.f64_observable_gauge(metric.name).with_description(metric.help);
+                    gauge.with_callback(callback).build();
+                }
                 Kind::Histogram(buckets) => {
                     let histogram = meter.f64_histogram(metric.name).with_description(metric.help);
                     histograms.insert(metric.name, histogram.with_boundaries(buckets.to_vec()).build());
@@ -57,31 +51,46 @@ impl OtlpRecorder {
     }
 }
 
-fn observe_counter(metric: &Metric, series: &Series, observer: &dyn AsyncInstrument<u64>) {
-    if let Some(value) = process::value(metric) {
-        return observer.observe(value, &[]);
-    }
-    series.visit_counters(|key, value| {
-        if key.name() == metric.name {
-            observer.observe(value.load(Ordering::Acquire), &attributes(key));
-        }
-    });
+fn new_series() -> Arc<Series> {
+    Arc::new(Series::atomic())
 }
 
-fn observe_gauge(metric: &Metric, series: &Series, observer: &dyn AsyncInstrument<f64>) {
+/// What an export reads of an instrument.
+type Callback<T> = Box<dyn Fn(&dyn AsyncInstrument<T>) + Send + Sync>;
+
+fn counter_callback(metric: &Metric, series: &Arc<Series>) -> Callback<u64> {
+    if let Some(of) = process::reading(metric) {
+        return Box::new(move |observer| observe_process(of, |value| observer.observe(value, &[])));
+    }
+    let series = series.clone();
+    Box::new(move |observer| {
+        series.visit_counters(|key, value| observer.observe(value.load(Ordering::Acquire), &attributes(key)));
+    })
+}
+
+fn gauge_callback(metric: &Metric, series: &Arc<Series>) -> Callback<f64> {
     if metric.name == TENANT_JOBS.name {
-        return tenants::for_each(|labels, jobs| {
-            observer.observe(jobs as f64, &labels.map(|(name, value)| KeyValue::new(name, value.to_owned())));
+        return Box::new(|observer| {
+            tenants::for_each(|labels, jobs| {
+                observer.observe(jobs as f64, &labels.map(|(name, value)| KeyValue::new(name, value.to_owned())));
+            });
         });
     }
-    if let Some(value) = process::value(metric) {
-        return observer.observe(value as f64, &[]);
+    if let Some(of) = process::reading(metric) {
+        return Box::new(move |observer| observe_process(of, |value| observer.observe(value as f64, &[])));
     }
-    series.visit_gauges(|key, value| {
-        if key.name() == metric.name {
+    let series = series.clone();
+    Box::new(move |observer| {
+        series.visit_gauges(|key, value| {
             observer.observe(f64::from_bits(value.load(Ordering::Acquire)), &attributes(key));
-        }
-    });
+        });
+    })
+}
+
+fn observe_process(of: fn(process::Usage) -> u64, observe: impl FnOnce(u64)) {
+    if let Some(usage) = process::Usage::latest() {
+        observe(of(usage));
+    }
 }
 
 fn attributes(key: &Key) -> Vec<KeyValue> {
@@ -97,11 +106,18 @@ impl Recorder for OtlpRecorder {
     fn describe_histogram(&self, _: KeyName, _: Option<Unit>, _: SharedString) {}
 
     fn register_counter(&self, key: &Key, _: &Metadata<'_>) -> Counter {
-        self.series.get_or_create_counter(key, |counter| Counter::from_arc(counter.clone()))
+        match self.series.get(key.name()) {
+            Some(series) => series.get_or_create_counter(key, |counter| Counter::from_arc(counter.clone())),
+            // Not in the catalogue: another library's.
+            None => Counter::noop(),
+        }
     }
 
     fn register_gauge(&self, key: &Key, _: &Metadata<'_>) -> Gauge {
-        self.series.get_or_create_gauge(key, |gauge| Gauge::from_arc(gauge.clone()))
+        match self.series.get(key.name()) {
+            Some(series) => series.get_or_create_gauge(key, |gauge| Gauge::from_arc(gauge.clone())),
+            None => Gauge::noop(),
+        }
     }
 
     fn register_histogram(&self, key: &Key, _: &Metadata<'_>) -> Histogram {
@@ -110,7 +126,6 @@ impl Recorder for OtlpRecorder {
                 histogram: histogram.clone(),
                 attributes: attributes(key),
             })),
-            // Not in the catalogue: another library's.
             None => Histogram::noop(),
         }
     }

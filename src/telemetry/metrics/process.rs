@@ -37,18 +37,17 @@ impl Usage {
     }
 }
 
-/// Value of a metric of the process as [`Usage::latest`] has it; `None` for every other metric.
-pub(super) fn value(metric: &Metric) -> Option<u64> {
-    let of: fn(Usage) -> u64 = if metric.name == PROCESS_MEMORY.name {
-        |usage| usage.memory_bytes
+/// Which part of the usage a metric is; `None` for one that is not of the process.
+pub(super) fn reading(metric: &Metric) -> Option<fn(Usage) -> u64> {
+    if metric.name == PROCESS_MEMORY.name {
+        Some(|usage| usage.memory_bytes)
     } else if metric.name == PROCESS_CPU.name {
-        |usage| usage.cpu_seconds
+        Some(|usage| usage.cpu_seconds)
     } else if metric.name == PROCESS_FILES.name {
-        |usage| usage.open_files
+        Some(|usage| usage.open_files)
     } else {
-        return None;
-    };
-    Usage::latest().map(of)
+        None
+    }
 }
 
 /// Of `/proc/self/status`, which has `VmRSS:  1234 kB`.
