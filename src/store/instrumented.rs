@@ -279,7 +279,8 @@ mod tests {
     use super::*;
     use crate::store::contract;
     use crate::store::sqlite::Sqlite;
-    use crate::telemetry::metrics::tests::{page_after, value};
+    use crate::telemetry::metrics::tests::page_after;
+    use crate::telemetry::scrape::Page;
 
     #[test]
     fn writes_that_come_too_late_are_counted() {
@@ -296,10 +297,10 @@ mod tests {
             store.heartbeat(&lease, contract::time(3), Duration::from_secs(1)).await.expect_err("too late");
             store.release(&lease, contract::time(3)).await.expect_err("too late");
         };
-        let page = page_after(|| runtime.block_on(late));
+        let page = Page::parse(&page_after(|| runtime.block_on(late)));
         for (operation, count) in [("heartbeat", 1.0), ("release", 1.0), ("finish", 0.0), ("record", 0.0)] {
             let series = format!("scpsfm_fenced_writes_total{{operation=\"{operation}\"}}");
-            assert_eq!(value(&page, &series), Some(count), "{operation}");
+            assert_eq!(page.value(&series), count, "{operation}");
         }
     }
 }

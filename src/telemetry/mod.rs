@@ -17,3 +17,7 @@ pub use server::Readiness;
 #[cfg(test)]
 #[path = "../../tests/it/support/collector.rs"]
 mod collector;
+#[cfg(test)]
+#[path = "../../tests/it/support/scrape.rs"]
+#[allow(dead_code, reason = "the tests of the whole use more of it")]
+pub(crate) mod scrape;

@@ -6,6 +6,7 @@ use std::time::{Duration, SystemTime};
 use super::*;
 use crate::domain::job::{Failure, JobName, Summary};
 use crate::domain::{SolveSettings, Status};
+use crate::telemetry::scrape::Page;
 
 const DASHBOARD: &str = include_str!("../../../deploy/grafana/dashboards/scpsfm.json");
 const RULES: &str = include_str!("../../../deploy/prometheus-rules.yml");
@@ -17,12 +18,6 @@ pub(crate) fn page_after(act: impl FnOnce()) -> String {
         act();
         page(&handle)
     })
-}
-
-/// Value of a series, written as it stands on the page.
-pub(crate) fn value(page: &str, series: &str) -> Option<f64> {
-    let line = page.lines().find(|line| line.strip_prefix(series).is_some_and(|rest| rest.starts_with(' ')))?;
-    line[series.len() + 1..].parse().ok()
 }
 
 pub(crate) fn ended(state: JobState, grade: Option<Grade>) -> Job {
@@ -100,6 +95,7 @@ fn every_metric_is_declared_once_named_by_convention_and_on_the_page() {
 #[test]
 fn what_is_known_beforehand_is_zero_before_the_first_job() {
     let page = page_after(|| {});
+    let samples = Page::parse(&page);
     for series in [
         "scpsfm_queue_depth",
         "scpsfm_workers_busy",
@@ -124,7 +120,7 @@ fn what_is_known_beforehand_is_zero_before_the_first_job() {
         "scpsfm_job_duration_seconds_count{state=\"SUCCEEDED\"}",
         "scpsfm_queue_wait_seconds_count",
     ] {
-        assert_eq!(value(&page, series), Some(0.0), "{series}");
+        assert_eq!(samples.value(series), 0.0, "{series}");
     }
     for never in ["scpsfm_jobs_total{state=\"QUEUED\"", "scpsfm_jobs_total{state=\"RUNNING\""] {
         assert!(!page.contains(never), "{never} is not terminal");
@@ -152,29 +148,30 @@ fn a_finished_job_counts_by_its_state_and_only_results_by_their_grade() {
         ("scpsfm_solve_iterations_count", 2.0),
         ("scpsfm_job_duration_seconds_sum{state=\"FAILED\"}", 2.5),
     ];
+    let samples = Page::parse(&page);
     for (series, wanted) in expected {
-        assert_eq!(value(&page, series), Some(wanted), "{series}");
+        assert_eq!(samples.value(series), wanted, "{series}");
     }
 }
 
 #[test]
 fn guards_give_back_what_they_took_and_a_dropped_call_is_cancelled() {
     let (recorder, handle) = recorder(None).expect("recorder");
-    let render = || handle.render();
+    let render = || Page::parse(&handle.render());
     metrics::with_local_recorder(&recorder, || {
         let (worker, watcher_guard) = (busy_worker(), watcher());
         let call = RpcCall::begin("scpsfm.v1.JobService/WatchJob");
         let during = render();
         for series in ["scpsfm_workers_busy", "scpsfm_watchers", "scpsfm_grpc_requests_in_flight"] {
-            assert_eq!(value(&during, series), Some(1.0), "{series}");
+            assert_eq!(during.value(series), 1.0, "{series}");
         }
         drop((worker, watcher_guard, call));
         let after = render();
         for series in ["scpsfm_workers_busy", "scpsfm_watchers", "scpsfm_grpc_requests_in_flight"] {
-            assert_eq!(value(&after, series), Some(0.0), "{series}");
+            assert_eq!(after.value(series), 0.0, "{series}");
         }
         let cancelled = "scpsfm_grpc_requests_total{method=\"scpsfm.v1.JobService/WatchJob\",code=\"CANCELLED\"}";
-        assert_eq!(value(&after, cancelled), Some(1.0), "{after}");
+        assert_eq!(after.value(cancelled), 1.0, "{after:?}");
     });
 }
 
@@ -198,8 +195,9 @@ fn an_attempt_tells_its_wait_its_worker_and_its_stages() {
         ("scpsfm_stage_duration_seconds_count{stage=\"search\",state=\"CANCELLED\"}", 1.0),
         ("scpsfm_stage_duration_seconds_count{stage=\"search\",state=\"SUCCEEDED\"}", 0.0),
     ];
+    let samples = Page::parse(&page);
     for (series, wanted) in expected {
-        assert_eq!(value(&page, series), Some(wanted), "{series}");
+        assert_eq!(samples.value(series), wanted, "{series}");
     }
 }
 

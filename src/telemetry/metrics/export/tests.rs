@@ -1,6 +1,5 @@
 //! What a collector gets is what stands on the page.
 
-use std::collections::BTreeMap;
 use std::time::Duration;
 
 use opentelemetry_proto::tonic::metrics::v1::{Metric as Exported, metric};
@@ -15,20 +14,7 @@ use crate::telemetry::metrics::{
     stage_finished, store_operation, tenant_jobs, watcher,
 };
 use crate::telemetry::otlp::{self, Export};
-
-/// The samples of a page, by series with the labels in the order of their names.
-fn on_page(page: &str) -> BTreeMap<String, f64> {
-    let lines = page.lines().filter(|line| !line.is_empty() && !line.starts_with('#'));
-    let samples = lines.map(|line| {
-        let (series, value) = line.rsplit_once(' ').expect("a series and its value");
-        let value = value.parse().expect("a number");
-        let Some((name, labels)) = series.split_once('{') else { return (series.to_owned(), value) };
-        let mut labels: Vec<&str> = labels.trim_end_matches('}').split(',').collect();
-        labels.sort_unstable();
-        (format!("{name}{{{}}}", labels.join(",")), value)
-    });
-    samples.collect()
-}
+use crate::telemetry::scrape::Page;
 
 /// Metrics that other tests, or the process itself, change between page and export.
 fn changes_meanwhile(series: &str) -> bool {
@@ -83,7 +69,7 @@ async fn a_collector_gets_the_series_of_the_page() {
     assert_eq!(exports.len(), 1, "one export, at the end");
     let resource = &exports[0].resource.as_ref().expect("a resource").attributes;
     assert_eq!(text(resource, "service.name").as_deref(), Some("scpsfm"));
-    let (expected, exported) = (on_page(&page), samples(&exports[0]));
+    let (expected, exported) = (Page::parse(&page).samples, samples(&exports[0]));
     assert_eq!(exported.get("scpsfm_jobs_created_total"), Some(&3.0));
     assert_eq!(exported.get("scpsfm_queue_wait_seconds_bucket{le=\"0.25\"}"), Some(&1.0));
     assert_eq!(exported.get("scpsfm_queue_wait_seconds_count"), Some(&3.0));
