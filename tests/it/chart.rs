@@ -168,10 +168,11 @@ fn what_the_chart_renders_is_taken_by_the_server() {
 #[test]
 fn slips_of_values_are_refused_by_name() {
     let Some(helm) = helm() else { return };
-    let cases: [(&[&str], &str); 7] = [
+    let cases: [(&[&str], &str); 8] = [
         (&["--set", "config.engine.wrokers=3"], "wrokers"),
         (&["--set", "replicas=3"], "replicas"),
         (&["--set", "config.store.retention=30"], "retention"),
+        (&["--set", "config.otlp.metrics=true"], "endpoint"),
         (&["--set", "tls.secret="], "tls.unencrypted=keys-in-the-clear"),
         (&["--set", "tls.secret=", "--set", "auth.keysSecret="], "tls.unencrypted=anyone"),
         (&["--set", "tls.unencrypted=anyone"], "tls.secret and tls.unencrypted"),
