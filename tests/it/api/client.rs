@@ -1,14 +1,22 @@
 //! The client library against a real server.
 
+use std::sync::Arc;
+use std::sync::atomic::Ordering;
+use std::time::Duration;
+
 use scpsfm::client::{Client, EncodedInput, Error, ErrorKind, JobOptions, Options, Setting, ended};
 use scpsfm::domain::job::{EventBody, JobEvent, JobState};
-use scpsfm::domain::{Input, Limits, Method, Silent, SolveSettings, StopToken};
-use scpsfm::engine::default_solver;
+use scpsfm::domain::{Input, Limits, Method, Silent, Solution, SolveSettings, StopToken, Warning, WarningCode};
+use scpsfm::engine::{Solver, default_solver};
+use scpsfm::rpc::proto::job_service_client::JobServiceClient;
+use scpsfm::rpc::{proto, server};
 use scpsfm::solver;
 use scpsfm::synthetic::{Scene, SceneOptions};
 use tokio_util::sync::CancellationToken;
+use tonic::transport::Channel;
 
-use crate::support::server::{TestServer, soon};
+use crate::support::connections::cutting;
+use crate::support::server::{TestServer, one_worker, soon};
 use crate::support::solvers::{held, quick, solution};
 use crate::support::wire::raw;
 
@@ -116,6 +124,55 @@ async fn a_watch_goes_on_over_a_restart_without_gap_or_repeat() {
     ended(&last.expect("watched to the end").expect("an event")).expect("solved after the restart");
     assert_eq!(sequences, (1..=sequences.len() as u64).collect::<Vec<_>>());
     drop(server);
+}
+
+#[tokio::test]
+async fn a_result_whose_download_is_cut_off_is_read_on_from_there() {
+    let server = TestServer::start(quick()).await;
+    let mut client = server.client().await;
+    let job = client.create(raw(2, 100_000), &settings(), JobOptions::default()).await.expect("a job");
+    soon(client.watch(&job.name, 0, &mut |_| ())).await.expect("watched");
+    let (url, received) = cutting(server.server.address(), usize::MAX).await;
+    let mut through = Client::connect(&url, &Options::default()).await.expect("a connection");
+    let expected = soon(through.read_result(&job.name)).await.expect("a result");
+    let whole = received.load(Ordering::SeqCst);
+    assert!(whole > 400_000, "{whole} bytes, of several chunks");
+
+    let (url, received) = cutting(server.server.address(), whole / 2).await;
+    let mut through = Client::connect(&url, &Options::default()).await.expect("a connection");
+    let found = soon(through.read_result(&job.name)).await;
+    assert!(found == Ok(expected), "another result");
+    let twice = received.load(Ordering::SeqCst);
+    // What was cut off within a chunk comes again.
+    assert!(twice < whole + whole / 4, "{twice} of {whole} bytes: read anew");
+}
+
+#[tokio::test]
+async fn a_result_that_the_server_has_no_memory_for_is_told_with_the_time_to_come_back() {
+    let solver: Solver = Arc::new(|input, settings, _observer, _stop| {
+        let warnings = vec![Warning::new(WarningCode::SecondStructure, "x".repeat(4 << 20))];
+        Ok(Solution { warnings, ..solution(input, settings) })
+    });
+    let options = server::Options { max_inflight_bytes: 4 << 20, ..server::Options::default() };
+    let server = TestServer::start_with(solver, options, one_worker()).await;
+    let mut client = server.client().await;
+    let job = client.create(raw(3, 4), &settings(), JobOptions::default()).await.expect("a job");
+    ended(&soon(client.watch(&job.name, 0, &mut |_| ())).await.expect("watched").expect("an event")).expect("solved");
+    // Another caller takes all of it, and reads on no further.
+    let endpoint = Channel::from_shared(server.url()).expect("a URL").initial_stream_window_size(65_535);
+    let mut other = JobServiceClient::new(endpoint.connect().await.expect("a connection"));
+    let request = proto::ReadJobResultRequest { name: job.name.to_string(), offset: 0 };
+    let held = other.read_job_result(request).await.expect("a stream").into_inner();
+    let error = soon(client.read_result(&job.name)).await.map(|_| ()).expect_err("no room");
+    assert_eq!((error.kind, error.reason.as_deref()), (ErrorKind::Unavailable, Some("MEMORY")));
+    assert!(error.message.ends_with("; try again in 2 s"), "{error}");
+    drop(held);
+    let freed = async {
+        while client.read_result(&job.name).await.is_err() {
+            tokio::time::sleep(Duration::from_millis(20)).await;
+        }
+    };
+    soon(freed).await;
 }
 
 #[tokio::test]

@@ -41,6 +41,39 @@ pub async fn counting(address: SocketAddr) -> (String, Arc<AtomicUsize>) {
     (url, connections)
 }
 
+/// The address of a proxy of this one that cuts the first connection off after so many bytes of the server, and how many
+/// have come of it over all connections.
+pub async fn cutting(address: SocketAddr, after: usize) -> (String, Arc<AtomicUsize>) {
+    let listener = TcpListener::bind("127.0.0.1:0").await.expect("a port");
+    let url = format!("http://{}", listener.local_addr().expect("an address"));
+    let received = Arc::new(AtomicUsize::new(0));
+    let counted = received.clone();
+    tokio::spawn(async move {
+        let mut limit = after;
+        while let Ok((outside, _)) = listener.accept().await {
+            let (mut read_outside, mut write_outside) = outside.into_split();
+            let inside = TcpStream::connect(address).await.expect("the server listens");
+            let (mut read_inside, mut write_inside) = inside.into_split();
+            let counted = counted.clone();
+            let upstream = tokio::spawn(async move { tokio::io::copy(&mut read_outside, &mut write_inside).await });
+            tokio::spawn(async move {
+                let mut buffer = vec![0; 1 << 14];
+                let mut passed = 0;
+                while let Ok(count @ 1..) = read_inside.read(&mut buffer).await {
+                    passed += count;
+                    counted.fetch_add(count, Ordering::SeqCst);
+                    if write_outside.write_all(&buffer[..count]).await.is_err() || passed > limit {
+                        break;
+                    }
+                }
+                upstream.abort();
+            });
+            limit = usize::MAX;
+        }
+    });
+    (url, received)
+}
+
 /// Reads until the other side closes the connection.
 pub async fn until_closed(mut connection: TcpStream) {
     let mut buffer = [0; 256];
