@@ -1,12 +1,12 @@
 //! A block extended metrically to every view that can be registered, and what that is worth.
 
 use super::model::Model;
-use super::options::{ExtensionOptions, GrowthOptions, StretchOptions};
+use super::options::{ExtensionOptions, GrowthOptions};
 use super::register;
 use super::{adjust, calibrate, components, growth, projective, structure};
 use crate::domain::{Grade, LeftOut, Stage, Task, Warning, WarningCode};
 use crate::geometry::bundle::metric::MetricReconstruction;
-use crate::solver::attempt::{self, Attempt, AttemptOptions};
+use crate::solver::attempt::{Attempt, AttemptOptions};
 use crate::solver::calibration::Outcome;
 use crate::solver::grow::LEAST_INLIERS;
 use crate::solver::problem::Problem;
@@ -124,22 +124,11 @@ impl Extended {
     }
 
     /// Whether nothing is to be gained by extending without a calibration: most views hold together so precisely that
-    /// wrong observations do not. Of more views than projective cameras are fitted to, the residuals under a
-    /// calibration must be of one kind, too: those of a street of 60 or 120 views that was bent to a wrong focal length
-    /// were not.
+    /// wrong observations do not, and fit as well as projective cameras or are METRIC.
     pub fn is_settled(&self, problem: &Problem) -> bool {
         let is_precise = self.model.noise <= AttemptOptions::DEFAULT.initial_noise;
         // Windows that differ a little warn of a mismatch of a METRIC one too.
-        is_precise
-            && self.holds_most_views()
-            && !(self.is_calibrated(problem) && self.is_bent(problem))
-            && (self.fits() || self.grade(problem) == Grade::Metric)
-    }
-
-    fn is_bent(&self, problem: &Problem) -> bool {
-        let (views, tracks) = (self.model.registered(), adjust::verified(&self.model));
-        views.len() > StretchOptions::DEFAULT.most_views
-            && attempt::are_mixed(adjust::Extract::new(problem, &self.model, &views, &tracks).squared_residuals())
+        is_precise && self.holds_most_views() && (self.fits() || self.grade(problem) == Grade::Metric)
     }
 
     pub fn holds_most_views(&self) -> bool {
