@@ -9,7 +9,7 @@
 use std::f64::consts::SQRT_2;
 
 use super::projective::{self, ProjectiveReconstruction};
-use super::{Ended, Extended, QUICK_SEED};
+use super::{Begun, Ended, Extended, QUICK_SEED};
 use crate::domain::Grade;
 use crate::geometry::bundle::metric::Intrinsics;
 use crate::geometry::homography;
@@ -54,9 +54,44 @@ pub fn explains_enough(evidence: f64, of_pinholes: f64) -> bool {
     evidence > OPTIONS.least_kept * of_pinholes
 }
 
+/// What came of an input behind lenses.
+pub struct BehindLenses {
+    pub ended: Ended,
+    undone: Option<Undone>,
+}
+
+impl BehindLenses {
+    /// The answer, its lenses undone in the problem.
+    pub fn stands_in(self, problem: &mut Problem) -> Ended {
+        problem.undone = self.undone;
+        self.ended
+    }
+}
+
+/// Solves an input behind the lenses that explain seeds better than pinholes, and where that does not replace what
+/// pinholes gave, behind those that it calibrated; `None` where no lens explains seeds better. Leaves no lens undone.
+///
+/// # Errors
+/// [`Error::Stopped`]; [`Error::Internal`] for defects.
+pub fn solve_behind(
+    problem: &mut Problem,
+    of_pinholes: &Ended,
+    recorder: &mut Recorder,
+) -> Result<Option<BehindLenses>, Error> {
+    if !undo(problem, recorder)? {
+        return Ok(None);
+    }
+    let mut ended = Begun::new(problem, recorder)?.finish(problem, recorder)?;
+    let calibrated = ended.calibrated_extension(problem).filter(|_| !ended.replaces(of_pinholes, problem));
+    if calibrated.is_some_and(|extended| undo_calibrated(problem, extended)) {
+        ended = Begun::new(problem, recorder)?.finish(problem, recorder)?;
+    }
+    Ok(Some(BehindLenses { ended, undone: problem.undone.take() }))
+}
+
 /// Undoes the lenses that an extension calibrated, each in place of a sampled one; whether there is any. A sampled lens
 /// is off by some per cent. Where a camera only turns, that error looks like parallax, and only some tracks fit it.
-pub fn undo_calibrated(problem: &mut Problem, extended: &Extended) -> bool {
+fn undo_calibrated(problem: &mut Problem, extended: &Extended) -> bool {
     let calibrated = |(camera, outcome): (usize, &Outcome)| {
         let lens = extended.model.lenses[camera];
         let stands = lens.is_known && outcome.grade != Grade::ProjectiveOnly && outcome.metric.is_some();
@@ -71,15 +106,8 @@ pub fn undo_calibrated(problem: &mut Problem, extended: &Extended) -> bool {
     true
 }
 
-/// Undoes the lenses that explain quick seeds of each camera better than pinholes do, where pinholes give no
-/// calibration of most views; whether any camera has one.
-///
-/// # Errors
-/// [`Error::Stopped`]; [`Error::Internal`] for defects.
-pub fn undo(problem: &mut Problem, ended: &Ended, recorder: &mut Recorder) -> Result<bool, Error> {
-    if problem.input.has_depths() || !ended.asks_for_lens(problem) {
-        return Ok(false);
-    }
+/// Undoes the lenses that explain quick seeds of each camera better than pinholes do; whether any camera has one.
+fn undo(problem: &mut Problem, recorder: &mut Recorder) -> Result<bool, Error> {
     for camera in 0..problem.cameras {
         let open: Vec<bool> = problem.camera_of.iter().map(|of| *of == camera).collect();
         let sets = view_selection::candidate_views_among(problem, &open);

@@ -59,86 +59,110 @@ pub enum Ended {
 }
 
 /// Solves an input. Where pinholes give no calibration of most views, solves it once more with the lenses undone that
-/// explain seeds better, and where that calibrates a part, with the lenses undone that were calibrated; what is undone
-/// stays so in the problem where that answer stands.
+/// explain seeds better, before anything else is tried of pinholes, and where that calibrates a part, with the lenses
+/// undone that were calibrated; what is undone stays so in the problem where that answer stands.
 ///
 /// # Errors
 /// [`Error::Stopped`]; [`Error::Internal`] for defects.
 pub fn solve(problem: &mut Problem, recorder: &mut Recorder) -> Result<Ended, Error> {
-    let ended = of_blocks(problem, recorder)?;
-    if !lens::undo(problem, &ended, recorder)? {
-        return Ok(ended);
-    }
-    let found = of_blocks(problem, recorder)?;
-    if found.replaces(&ended, problem) {
-        return Ok(found);
-    }
-    if found.calibrated_extension(problem).is_some_and(|extended| lens::undo_calibrated(problem, extended)) {
-        drop(found);
-        let found = of_blocks(problem, recorder)?;
-        if found.replaces(&ended, problem) {
-            return Ok(found);
+    let begun = Begun::new(problem, recorder)?;
+    let mut behind = None;
+    // Of most views pinholes have said what they explain: the rest would only repeat it.
+    let is_told = begun.ended().asks_for_lens(problem) && begun.ended().extends_to_most_views();
+    if is_told {
+        behind = lens::solve_behind(problem, begun.ended(), recorder)?;
+        let stands = |ended: &Ended| ended.extends_to_most_views() && ended.replaces(begun.ended(), problem);
+        if let Some(found) = behind.take_if(|found| stands(&found.ended)) {
+            return Ok(found.stands_in(problem));
         }
     }
-    problem.undone = None;
-    Ok(ended)
+    let ended = begun.finish(problem, recorder)?;
+    if !is_told && ended.asks_for_lens(problem) {
+        behind = lens::solve_behind(problem, &ended, recorder)?;
+    }
+    match behind.filter(|found| found.ended.replaces(&ended, problem)) {
+        Some(found) => Ok(found.stands_in(problem)),
+        None => Ok(ended),
+    }
 }
 
-/// Solves and extends block after block until one carries a reconstruction of most of the views.
-///
-/// In order of cost: the blocks, searched quickly, calibrated and extended metrically; what they found and small
-/// subsets of them, extended projectively and calibrated then; where that is not METRIC and holds less than half of the
-/// views, triplets in the same way. Only where none of these stands: the blocks again, with everything that a search
-/// can try, and the subsets that are left. An input whose tracks are mostly complete is its only block; with depths it
-/// is searched at length at once.
-///
-/// # Errors
-/// [`Error::Stopped`]; [`Error::Internal`] for defects.
-fn of_blocks(problem: &Problem, recorder: &mut Recorder) -> Result<Ended, Error> {
-    let blocks = Blocks::of(problem);
-    // In the one block of a whole input depths decide in the first round or take all of them. Other blocks are several,
-    // of which another may do.
-    let is_quick = !(blocks.is_whole && problem.input.has_depths());
-    // A calibrated reconstruction that another might be better than.
-    let mut metric: Option<Box<Extended>> = None;
-    let first = match blocks.by_calibration(problem, is_quick, recorder)? {
-        ControlFlow::Break(ended) => return Ok(ended),
-        ControlFlow::Continue(Ended::Extended(extended)) if extended.is_calibrated(problem) => {
-            metric = Some(extended);
-            None
-        }
-        ControlFlow::Continue(ended) => ended.seed(),
-    };
-    let subsets = view_selection::subsets(&blocks.sets);
-    let is_short = blocks.is_whole || metric.is_some();
-    let cheap = if is_short { ExtensionOptions::DEFAULT.first_subsets.min(subsets.len()) } else { subsets.len() };
-    let (cheap, rest) = subsets.split_at(cheap);
-    // Nothing else is searched of a whole input with depths: what it has found stands.
-    let mut best = by_projective_extension(problem, None, starts(first, !is_quick, cheap), recorder)?;
-    let leaves_most = |best: &Attempt| !best.is_good() && best.leaves_most_views(problem);
-    if !blocks.is_whole && metric.is_none() && best.as_ref().is_none_or(leaves_most) {
-        let triplets = view_selection::triplets(problem, &vec![true; problem.views()]);
-        let starts = triplets.into_iter().map(|views| Start::Views(SeedViews::Triplet(views))).collect();
-        best = by_projective_extension(problem, best, starts, recorder)?;
+/// An input begun: its blocks, and what their quick search, calibration and metric extension came to.
+struct Begun {
+    blocks: Blocks,
+    is_quick: bool,
+    /// Breaks where nothing else needs to be tried.
+    first: ControlFlow<Ended, Ended>,
+}
+
+impl Begun {
+    fn new(problem: &Problem, recorder: &mut Recorder) -> Result<Self, Error> {
+        let blocks = Blocks::of(problem);
+        // In the one block of a whole input depths decide in the first round or take all of them. Other blocks are
+        // several, of which another may do.
+        let is_quick = !(blocks.is_whole && problem.input.has_depths());
+        let first = blocks.by_calibration(problem, is_quick, recorder)?;
+        Ok(Self { blocks, is_quick, first })
     }
-    if is_quick && metric.is_none() && !stands(&best) {
-        let first = match blocks.by_calibration(problem, false, recorder)? {
+
+    fn ended(&self) -> &Ended {
+        match &self.first {
+            ControlFlow::Break(ended) | ControlFlow::Continue(ended) => ended,
+        }
+    }
+
+    /// Solves and extends block after block until one carries a reconstruction of most of the views.
+    ///
+    /// In order of cost: the blocks, searched quickly, calibrated and extended metrically; what they found and small
+    /// subsets of them, extended projectively and calibrated then; where that is not METRIC and holds less than half of
+    /// the views, triplets in the same way. Only where none of these stands: the blocks again, with everything that a
+    /// search can try, and the subsets that are left. An input whose tracks are mostly complete is its only block; with
+    /// depths it is searched at length at once.
+    ///
+    /// # Errors
+    /// [`Error::Stopped`]; [`Error::Internal`] for defects.
+    fn finish(self, problem: &Problem, recorder: &mut Recorder) -> Result<Ended, Error> {
+        let Self { blocks, is_quick, first } = self;
+        // A calibrated reconstruction that another might be better than.
+        let mut metric: Option<Box<Extended>> = None;
+        let first = match first {
             ControlFlow::Break(ended) => return Ok(ended),
             ControlFlow::Continue(Ended::Extended(extended)) if extended.is_calibrated(problem) => {
-                return Ok(Ended::Extended(extended));
+                metric = Some(extended);
+                None
             }
             ControlFlow::Continue(ended) => ended.seed(),
         };
-        best = by_projective_extension(problem, None, starts(first, false, rest), recorder)?;
-    }
-    let best = best.filter(|best| metric.is_none() || best.is_trusted());
-    Ok(match (best.map(|best| metric_of(problem, best, recorder)).transpose()?, metric) {
-        (Some(Ended::Extended(found)), Some(metric)) if found.rank(problem) > metric.rank(problem) => {
-            Ended::Extended(found)
+        let subsets = view_selection::subsets(&blocks.sets);
+        let is_short = blocks.is_whole || metric.is_some();
+        let cheap = if is_short { ExtensionOptions::DEFAULT.first_subsets.min(subsets.len()) } else { subsets.len() };
+        let (cheap, rest) = subsets.split_at(cheap);
+        // Nothing else is searched of a whole input with depths: what it has found stands.
+        let mut best = by_projective_extension(problem, None, starts(first, !is_quick, cheap), recorder)?;
+        let leaves_most = |best: &Attempt| !best.is_good() && best.leaves_most_views(problem);
+        if !blocks.is_whole && metric.is_none() && best.as_ref().is_none_or(leaves_most) {
+            let triplets = view_selection::triplets(problem, &vec![true; problem.views()]);
+            let starts = triplets.into_iter().map(|views| Start::Views(SeedViews::Triplet(views))).collect();
+            best = by_projective_extension(problem, best, starts, recorder)?;
         }
-        (_, Some(metric)) => Ended::Extended(metric),
-        (found, None) => found.unwrap_or(Ended::Block(None)),
-    })
+        if is_quick && metric.is_none() && !stands(&best) {
+            let first = match blocks.by_calibration(problem, false, recorder)? {
+                ControlFlow::Break(ended) => return Ok(ended),
+                ControlFlow::Continue(Ended::Extended(extended)) if extended.is_calibrated(problem) => {
+                    return Ok(Ended::Extended(extended));
+                }
+                ControlFlow::Continue(ended) => ended.seed(),
+            };
+            best = by_projective_extension(problem, None, starts(first, false, rest), recorder)?;
+        }
+        let best = best.filter(|best| metric.is_none() || best.is_trusted());
+        Ok(match (best.map(|best| metric_of(problem, best, recorder)).transpose()?, metric) {
+            (Some(Ended::Extended(found)), Some(metric)) if found.rank(problem) > metric.rank(problem) => {
+                Ended::Extended(found)
+            }
+            (_, Some(metric)) => Ended::Extended(metric),
+            (found, None) => found.unwrap_or(Ended::Block(None)),
+        })
+    }
 }
 
 /// The first projective reconstruction that a quick search leads to, without a calibration: of blocks, and where
@@ -185,6 +209,9 @@ pub fn reconstruct_quickly(
 impl Ended {
     /// Whether there is a reconstruction without a calibration of most views, which a lens may be missing from.
     fn asks_for_lens(&self, problem: &Problem) -> bool {
+        if problem.input.has_depths() {
+            return false;
+        }
         match self {
             Ended::Extended(extended) => !extended.is_calibrated(problem) || !extended.holds_most_views(),
             Ended::Block(attempt) => attempt.as_ref().is_some_and(|attempt| {
@@ -193,6 +220,10 @@ impl Ended {
                     && (!attempt.is_calibrated() || attempt.leaves_most_views(problem))
             }),
         }
+    }
+
+    fn extends_to_most_views(&self) -> bool {
+        matches!(self, Ended::Extended(extended) if extended.holds_most_views())
     }
 
     /// The extension that carries the calibration; `None` where there is none. The calibration of a block takes an
