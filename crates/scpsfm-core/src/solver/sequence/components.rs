@@ -104,7 +104,7 @@ fn add(
     model.add_component(problem, component, attempt.views(), metric, calibration.focals.as_deref());
     structure::triangulate_seen(problem, model, attempt.views(), recorder);
     register::join(problem, model, component, trials, recorder)?;
-    drop_unsupported(problem, model, component, recorder);
+    drop_unsupported(problem, model, component, &GrowthOptions::METRIC, recorder);
     let stands = !model.of_component(component).is_empty();
     let mut grown = component;
     while let Some(into) = merging::merge(problem, model, grown, recorder) {
@@ -112,6 +112,27 @@ fn add(
         grown = into;
     }
     Ok(stands)
+}
+
+/// Joins the views that are left by fewer points, see [`GrowthOptions::LAST`], and merges what these connect.
+///
+/// # Errors
+/// [`Error::Stopped`].
+pub fn join_rest(
+    problem: &Problem,
+    model: &mut Model,
+    trials: &mut [Trial],
+    recorder: &mut Recorder,
+) -> Result<(), Error> {
+    let rest: Vec<usize> = (0..problem.views()).filter(|&view| model.poses[view].is_none()).collect();
+    for component in model.components() {
+        let mut grown = Some(component).filter(|_| !rest.is_empty() && !model.of_component(component).is_empty());
+        while let Some(component) = grown {
+            register::join_again(problem, model, component, &GrowthOptions::LAST, &rest, trials, recorder)?;
+            grown = merging::merge(problem, model, component, recorder);
+        }
+    }
+    Ok(())
 }
 
 /// What a component begins from.
@@ -163,13 +184,19 @@ fn priors(problem: &Problem, seed: &Attempt, model: &Model) -> Vec<Option<FocalP
 
 /// Takes back the views of a component that see too few of its points to be held by them, and the whole component if
 /// too few are left. Returns the views taken back.
-pub fn drop_unsupported(problem: &Problem, model: &mut Model, component: u32, recorder: &mut Recorder) -> Vec<usize> {
+pub fn drop_unsupported(
+    problem: &Problem,
+    model: &mut Model,
+    component: u32,
+    options: &GrowthOptions,
+    recorder: &mut Recorder,
+) -> Vec<usize> {
     let unsupported = |&view: &usize| {
         let kept = problem.of_view[view].iter().filter(|&&k| {
             let k = k as usize;
             model.kept[k] && model.landmarks[problem.track_of(k)].is_some_and(|landmark| landmark.is_verified())
         });
-        kept.count() < GrowthOptions::METRIC.least_agreeing
+        kept.count() < options.least_agreeing
     };
     let views = model.of_component(component);
     let mut dropped: Vec<usize> = views.iter().copied().filter(unsupported).collect();

@@ -33,8 +33,10 @@ pub fn extend(problem: &Problem, seed: Attempt, recorder: &mut Recorder) -> Resu
     let mut trials = vec![growth::Trial::default(); problem.views()];
     register::join(problem, &mut model, components::FIRST, &mut trials, recorder)?;
     components::others(problem, &mut model, &seed, &mut trials, recorder)?;
+    components::join_rest(problem, &mut model, &mut trials, recorder)?;
     recorder.end_components();
-    let rounds = GrowthOptions::METRIC.final_rounds;
+    let options = GrowthOptions::LAST;
+    let rounds = options.final_rounds;
     for round in 0..rounds {
         problem.stopped()?;
         let within = OPTIONS.share_of_registering + (1.0 - OPTIONS.share_of_registering) * round as f64 / rounds as f64;
@@ -42,10 +44,10 @@ pub fn extend(problem: &Problem, seed: Attempt, recorder: &mut Recorder) -> Resu
         adjust::all(problem, &mut model, recorder);
         structure::triangulate(problem, &mut model, recorder);
         for component in 0..=model.component_of.iter().copied().max().unwrap_or(components::FIRST) {
-            let dropped = components::drop_unsupported(problem, &mut model, component, recorder);
+            let dropped = components::drop_unsupported(problem, &mut model, component, &options, recorder);
             // After the last round nothing would check the views that join.
             if !dropped.is_empty() && round + 1 < rounds {
-                register::join_again(problem, &mut model, component, &dropped, &mut trials, recorder)?;
+                register::join_again(problem, &mut model, component, &options, &dropped, &mut trials, recorder)?;
             }
         }
         recorder.report(within);

@@ -48,6 +48,11 @@ options! {
 impl GrowthOptions {
     pub const METRIC: Self = Self::DEFAULT;
 
+    /// Of the views that are left when nothing else joins: those that a component of their own or a merger could take
+    /// are not to be held by so few points. Three beside those of the pose, each of which agrees with a wrong one by
+    /// chance in four cases of ten thousand at a noise of a thousandth of the image, of a thousand at three thousandths.
+    pub const LAST: Self = Self { least_agreeing: 6, ..Self::METRIC };
+
     /// Of projective cameras.
     pub const PROJECTIVE: Self = Self {
         // Six determine a camera, and each of the others agrees with a wrong one by chance in a few cases of a

@@ -23,6 +23,7 @@ struct Component<'a> {
     problem: &'a Problem<'a>,
     model: &'a mut Model,
     component: u32,
+    options: &'a GrowthOptions,
     rng: ChaCha8Rng,
 }
 
@@ -39,14 +40,14 @@ pub fn join(
 ) -> Result<(), Error> {
     // Views that another component could not take may fit this one.
     trials.iter_mut().for_each(|trial| trial.count = 0);
-    let mut growth = Component::new(problem, model, component);
+    let mut growth = Component::new(problem, model, component, &OPTIONS);
     growth.settle(recorder);
     growth::grow(problem, &mut growth, &OPTIONS, trials, recorder)
 }
 
-/// Tries the views again that a component has lost, as [`join`] does: what stands without them may place them better.
+/// Tries these views again, as [`join`] does: what stands now may place them better.
 ///
-/// * `dropped`: their trials count anew
+/// * `views`: their trials count anew
 ///
 /// # Errors
 /// [`Error::Stopped`].
@@ -54,18 +55,19 @@ pub fn join_again(
     problem: &Problem,
     model: &mut Model,
     component: u32,
-    dropped: &[usize],
+    options: &GrowthOptions,
+    views: &[usize],
     trials: &mut [Trial],
     recorder: &mut Recorder,
 ) -> Result<(), Error> {
-    dropped.iter().for_each(|&view| trials[view].count = 0);
-    growth::grow(problem, &mut Component::new(problem, model, component), &OPTIONS, trials, recorder)
+    views.iter().for_each(|&view| trials[view].count = 0);
+    growth::grow(problem, &mut Component::new(problem, model, component, options), options, trials, recorder)
 }
 
 impl<'a> Component<'a> {
-    fn new(problem: &'a Problem<'a>, model: &'a mut Model, component: u32) -> Self {
+    fn new(problem: &'a Problem<'a>, model: &'a mut Model, component: u32, options: &'a GrowthOptions) -> Self {
         model.turn_to(problem, component);
-        Self { problem, model, component, rng: ChaCha8Rng::seed_from_u64(problem.settings.seed) }
+        Self { problem, model, component, options, rng: ChaCha8Rng::seed_from_u64(problem.settings.seed) }
     }
 }
 
@@ -101,7 +103,7 @@ impl Growth for Component<'_> {
     }
 
     fn register(&mut self, view: usize, seen: &[usize], recorder: &mut Recorder) -> usize {
-        let Self { problem, model, component, rng } = self;
+        let Self { problem, model, component, options, rng } = self;
         let is_new_lens = model.is_focal_unknown(problem, view);
         let found = guesses(problem, model, view)
             .into_iter()
@@ -110,7 +112,7 @@ impl Growth for Component<'_> {
             .rev()
             .max_by_key(|(_, (_, agreeing))| *agreeing);
         let Some((intrinsics, (pose, agreeing))) = found else { return 0 };
-        if agreeing < OPTIONS.least_agreeing || (agreeing as f64) < OPTIONS.least_share * seen.len() as f64 {
+        if agreeing < options.least_agreeing || (agreeing as f64) < options.least_share * seen.len() as f64 {
             return agreeing;
         }
         model.set_intrinsics(problem, view, intrinsics);

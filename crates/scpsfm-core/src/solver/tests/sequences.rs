@@ -205,6 +205,37 @@ fn what_shares_no_tracks_is_in_parts_of_one_calibration() {
     }
 }
 
+/// Seven right points hold a view, beside as many wrong observations; four do not.
+#[test]
+fn a_view_that_sees_few_points_joins_at_last() {
+    const VIEW: u32 = 10;
+    for seed in 0..3 {
+        let options = SequenceOptions { tracks: 800, outliers: 0.3, seed, ..SequenceOptions::default() };
+        let sequence = Sequence::generate(&options).expect("valid");
+        let mut observations = vec![0; options.tracks];
+        sequence.input.track.iter().for_each(|&track| observations[track as usize] += 1);
+        for (points, joins) in [(7, true), (4, false)] {
+            let mut left = [points; 2];
+            let mut keep = |k: usize| {
+                let track = sequence.input.track[k] as usize;
+                if sequence.input.view[k] != VIEW {
+                    return true;
+                }
+                let left = &mut left[usize::from(sequence.truth.observation_right[k])];
+                let is_kept = observations[track] >= 4 && *left > 0;
+                *left -= usize::from(is_kept);
+                is_kept
+            };
+            let kept: Vec<bool> = (0..sequence.input.x.len()).map(&mut keep).collect();
+            let raw = thinned(&sequence, |k| kept[k]);
+            let input = Input::new(raw, &Limits::default(), "sequence").expect("valid input");
+            let solution = solved(&input, &SolveSettings { seed, ..SolveSettings::default() });
+            let has_joined = solution.registered_views().contains(&(VIEW as usize));
+            assert_eq!(has_joined, joins, "seed {seed}, {points} points: {:?}", solution.warnings);
+        }
+    }
+}
+
 #[test]
 fn a_view_of_nothing_but_wrong_observations_is_left_out_with_the_reason() {
     let options = SequenceOptions { tracks: 800, outliers: 0.2, seed: 3, ..SequenceOptions::default() };
