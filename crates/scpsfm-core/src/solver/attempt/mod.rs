@@ -218,7 +218,7 @@ impl Attempt {
 }
 
 /// Whether squared residuals are of several kinds, most small and some large.
-pub fn are_mixed(mut squared: Vec<f64>) -> bool {
+fn are_mixed(mut squared: Vec<f64>) -> bool {
     let mean = squared.iter().sum::<f64>() / squared.len().max(1) as f64;
     median(&mut squared) < OPTIONS.least_median_share * mean
 }
