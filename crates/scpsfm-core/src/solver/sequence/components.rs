@@ -126,10 +126,16 @@ pub fn join_rest(
 ) -> Result<(), Error> {
     let rest: Vec<usize> = (0..problem.views()).filter(|&view| model.poses[view].is_none()).collect();
     for component in model.components() {
-        let mut grown = Some(component).filter(|_| !rest.is_empty() && !model.of_component(component).is_empty());
-        while let Some(component) = grown {
-            register::join_again(problem, model, component, &GrowthOptions::LAST, &rest, trials, recorder)?;
-            grown = merging::merge(problem, model, component, recorder);
+        let views = model.of_component(component).len();
+        if rest.is_empty() || views == 0 {
+            continue;
+        }
+        register::join_again(problem, model, component, &GrowthOptions::LAST, &rest, trials, recorder)?;
+        let has_grown = model.of_component(component).len() > views;
+        let mut merged = has_grown.then(|| merging::merge(problem, model, component, recorder)).flatten();
+        while let Some(into) = merged {
+            register::join_again(problem, model, into, &GrowthOptions::LAST, &rest, trials, recorder)?;
+            merged = merging::merge(problem, model, into, recorder);
         }
     }
     Ok(())

@@ -9,7 +9,7 @@
 use std::f64::consts::SQRT_2;
 
 use super::projective::{self, ProjectiveReconstruction};
-use super::{Begun, Ended, Extended, QUICK_SEED};
+use super::{Ended, Extended, QUICK_SEED, QuickPass};
 use crate::domain::Grade;
 use crate::geometry::bundle::metric::Intrinsics;
 use crate::geometry::homography;
@@ -62,14 +62,14 @@ pub struct BehindLenses {
 
 impl BehindLenses {
     /// The answer, its lenses undone in the problem.
-    pub fn stands_in(self, problem: &mut Problem) -> Ended {
+    pub fn accept(self, problem: &mut Problem) -> Ended {
         problem.undone = self.undone;
         self.ended
     }
 }
 
 /// Solves an input behind the lenses that explain seeds better than pinholes, and where that does not replace what
-/// pinholes gave, behind those that it calibrated; `None` where no lens explains seeds better. Leaves no lens undone.
+/// pinholes gave, behind those that it calibrated; `None` where no lens explains seeds better. No lens is undone then.
 ///
 /// # Errors
 /// [`Error::Stopped`]; [`Error::Internal`] for defects.
@@ -81,10 +81,10 @@ pub fn solve_behind(
     if !undo(problem, recorder)? {
         return Ok(None);
     }
-    let mut ended = Begun::new(problem, recorder)?.finish(problem, recorder)?;
+    let mut ended = QuickPass::new(problem, recorder)?.finish(problem, recorder)?;
     let calibrated = ended.calibrated_extension(problem).filter(|_| !ended.replaces(of_pinholes, problem));
     if calibrated.is_some_and(|extended| undo_calibrated(problem, extended)) {
-        ended = Begun::new(problem, recorder)?.finish(problem, recorder)?;
+        ended = QuickPass::new(problem, recorder)?.finish(problem, recorder)?;
     }
     Ok(Some(BehindLenses { ended, undone: problem.undone.take() }))
 }

@@ -65,47 +65,51 @@ pub enum Ended {
 /// # Errors
 /// [`Error::Stopped`]; [`Error::Internal`] for defects.
 pub fn solve(problem: &mut Problem, recorder: &mut Recorder) -> Result<Ended, Error> {
-    let begun = Begun::new(problem, recorder)?;
+    let quick = QuickPass::new(problem, recorder)?;
     let mut behind = None;
-    // Of most views pinholes have said what they explain: the rest would only repeat it.
-    let is_told = begun.ended().asks_for_lens(problem) && begun.ended().extends_to_most_views();
-    if is_told {
-        behind = lens::solve_behind(problem, begun.ended(), recorder)?;
-        let stands = |ended: &Ended| ended.extends_to_most_views() && ended.replaces(begun.ended(), problem);
-        if let Some(found) = behind.take_if(|found| stands(&found.ended)) {
-            return Ok(found.stands_in(problem));
+    // An extension to most views shows how much pinholes explain, which what else there is to try hardly changes.
+    let lenses_first = quick.result().asks_for_lens(problem) && quick.result().holds_most_views();
+    if lenses_first {
+        behind = lens::solve_behind(problem, quick.result(), recorder)?;
+        let replaces = |ended: &Ended| ended.holds_most_views() && ended.replaces(quick.result(), problem);
+        if let Some(found) = behind.take_if(|found| replaces(&found.ended)) {
+            return Ok(found.accept(problem));
         }
+        recorder.begin_again();
     }
-    let ended = begun.finish(problem, recorder)?;
-    if !is_told && ended.asks_for_lens(problem) {
+    let ended = quick.finish(problem, recorder)?;
+    if !ended.asks_for_lens(problem) {
+        return Ok(ended);
+    }
+    if !lenses_first {
         behind = lens::solve_behind(problem, &ended, recorder)?;
     }
     match behind.filter(|found| found.ended.replaces(&ended, problem)) {
-        Some(found) => Ok(found.stands_in(problem)),
+        Some(found) => Ok(found.accept(problem)),
         None => Ok(ended),
     }
 }
 
-/// An input begun: its blocks, and what their quick search, calibration and metric extension came to.
-struct Begun {
+/// The blocks of an input, and what their first search, calibration and metric extension came to.
+struct QuickPass {
     blocks: Blocks,
     is_quick: bool,
     /// Breaks where nothing else needs to be tried.
-    first: ControlFlow<Ended, Ended>,
+    result: ControlFlow<Ended, Ended>,
 }
 
-impl Begun {
+impl QuickPass {
     fn new(problem: &Problem, recorder: &mut Recorder) -> Result<Self, Error> {
         let blocks = Blocks::of(problem);
         // In the one block of a whole input depths decide in the first round or take all of them. Other blocks are
         // several, of which another may do.
         let is_quick = !(blocks.is_whole && problem.input.has_depths());
-        let first = blocks.by_calibration(problem, is_quick, recorder)?;
-        Ok(Self { blocks, is_quick, first })
+        let result = blocks.by_calibration(problem, is_quick, recorder)?;
+        Ok(Self { blocks, is_quick, result })
     }
 
-    fn ended(&self) -> &Ended {
-        match &self.first {
+    fn result(&self) -> &Ended {
+        match &self.result {
             ControlFlow::Break(ended) | ControlFlow::Continue(ended) => ended,
         }
     }
@@ -121,10 +125,10 @@ impl Begun {
     /// # Errors
     /// [`Error::Stopped`]; [`Error::Internal`] for defects.
     fn finish(self, problem: &Problem, recorder: &mut Recorder) -> Result<Ended, Error> {
-        let Self { blocks, is_quick, first } = self;
+        let Self { blocks, is_quick, result } = self;
         // A calibrated reconstruction that another might be better than.
         let mut metric: Option<Box<Extended>> = None;
-        let first = match first {
+        let first = match result {
             ControlFlow::Break(ended) => return Ok(ended),
             ControlFlow::Continue(Ended::Extended(extended)) if extended.is_calibrated(problem) => {
                 metric = Some(extended);
@@ -222,7 +226,8 @@ impl Ended {
         }
     }
 
-    fn extends_to_most_views(&self) -> bool {
+    /// Whether it is an extension that holds most views, see [`Extended::holds_most_views`].
+    fn holds_most_views(&self) -> bool {
         matches!(self, Ended::Extended(extended) if extended.holds_most_views())
     }
 

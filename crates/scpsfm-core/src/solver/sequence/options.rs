@@ -9,8 +9,9 @@ use crate::solver::view_selection::{self, ViewSelectionOptions};
 options! {
     /// How views are added; the values are those of metric cameras.
     pub struct GrowthOptions {
-        /// Points that a view must see before it is tried, and that must agree with its camera. Three determine a pose,
-        /// and each of the other five agrees with a wrong one by chance in one case of a hundred.
+        /// Points that a view must see before it is tried, and that must agree with its camera. Three determine a pose.
+        /// Each of the other five agrees with a wrong one by chance in four cases of ten thousand at a noise of a
+        /// thousandth of the image, in four of a thousand at three thousandths; some thousand poses are tried.
         least_agreeing: usize = 8,
         /// Share of the points seen that must agree. Below, the samples of the robust pose do not suffice.
         least_share: f64 = 0.1,
@@ -48,9 +49,9 @@ options! {
 impl GrowthOptions {
     pub const METRIC: Self = Self::DEFAULT;
 
-    /// Of the views that are left when nothing else joins: those that a component of their own or a merger could take
-    /// are not to be held by so few points. Three beside those of the pose, each of which agrees with a wrong one by
-    /// chance in four cases of ten thousand at a noise of a thousandth of the image, of a thousand at three thousandths.
+    /// Of the views that are left when nothing else joins, and of those that stay to the end: what a component of its own
+    /// or a merger could take is not to be held by so few points. At the noise of images, three thousandths and less,
+    /// three beside those of the pose agree with a wrong one once in ten million poses or less.
     pub const LAST: Self = Self { least_agreeing: 6, ..Self::METRIC };
 
     /// Of projective cameras.
