@@ -182,4 +182,7 @@ fn slips_of_values_are_refused_by_name() {
         let error = rendered(&helm, None, flags).expect_err("refused");
         assert!(error.contains(said), "{flags:?}: {error}");
     }
+    // The endpoint of a secret, which wins over the file.
+    let of_environment = ["config.otlp.metrics=true", "extraEnv[0].name=SCPSFM_OTLP__ENDPOINT"];
+    rendered(&helm, None, &of_environment.map(|value| ["--set", value]).concat()).expect("an endpoint is given");
 }
