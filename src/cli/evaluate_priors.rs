@@ -37,7 +37,8 @@ pub struct PriorArgs {
     #[arg(long, requires = "priors", conflicts_with = "auto_only")]
     pub sweep: bool,
 
-    /// The scenes of these names, or all whose names hold these texts, separated by commas without a space [default: all]
+    /// The scenes of these names, or all whose names hold these texts, separated by commas; a comma before a space is
+    /// part of a name [default: all]
     #[arg(long, value_name = "TEXTS", requires = "suite", conflicts_with = "real")]
     pub scenes: Option<String>,
 }

@@ -144,7 +144,7 @@ impl Drop for TransferView {
     }
 }
 
-/// Shows how many runs are done: a bar on a terminal, a line for each run that takes its time elsewhere.
+/// Shows how many runs are done: a bar on a terminal; elsewhere a line a second at most, and one for the last run.
 pub struct RunsView {
     bar: ProgressBar,
     has_lines: bool,
@@ -167,7 +167,7 @@ impl RunsView {
         Self { bar, has_lines: !quiet && !has_bar, last_line: Cell::new(None) }
     }
 
-    /// A run begins, or ended.
+    /// Names the run that is shown.
     pub fn show(&self, what: String) {
         self.bar.set_message(what);
     }
@@ -188,6 +188,12 @@ impl RunsView {
     /// Takes the bar away.
     pub fn finish(&self) {
         self.bar.finish_and_clear();
+    }
+}
+
+impl Drop for RunsView {
+    fn drop(&mut self) {
+        self.finish();
     }
 }
 

@@ -1,6 +1,7 @@
 //! `report.html`: one self-contained page that shows a result to a person, without a network.
 //!
-//! May depend on `domain` and on what `formats` says of results: labels, warnings, counts. Every string is escaped on its way into the page.
+//! May depend on `domain` and on what `formats` says of results: labels, warnings, counts. Every string is escaped on its
+//! way into the page.
 
 pub mod calibration;
 pub mod chart;

@@ -12,8 +12,8 @@ pub fn section(solution: &Solution) -> String {
         return String::new();
     }
     let mut html = String::from(
-        "<section id=\"second-structures\">\n<h2>Second structures</h2>\n<p>Rejected tracks that agree on rigid motions of \
-         their own. Each has a frame and a scale of its own; second-structures.json holds poses and points.</p>\n\
+        "<section id=\"second-structures\">\n<h2>Second structures</h2>\n<p>Rejected tracks that agree on rigid motions \
+         of their own. Each has a frame and a scale of its own; second-structures.json holds poses and points.</p>\n\
          <div class=\"table\"><table>\n<tr><th>number</th><th>kind</th><th>tracks</th><th>views with poses</th>\
          <th>points</th></tr>\n",
     );

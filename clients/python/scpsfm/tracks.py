@@ -580,7 +580,7 @@ def _view_problems(views: Sequence[View]) -> Iterator[tuple[str, str]]:
                 yield f"{field}.name", f"is longer than {MAX_NAME_BYTES} bytes"
             if _is_control(view.name):
                 yield f"{field}.name", f"{view.name!r} holds control characters"
-        if view.size is not None and np.shape(view.size) != (2,):
+        if view.size is not None and not (isinstance(view.size, Sequence | np.ndarray) and len(view.size) == 2):
             yield f"{field}.size", f"{view.size!r} is not a width and a height"
         elif view.size is not None:
             for side, what in zip(view.size, ("width", "height"), strict=True):

@@ -41,8 +41,8 @@ pub async fn counting(address: SocketAddr) -> (String, Arc<AtomicUsize>) {
     (url, connections)
 }
 
-/// The address of a proxy of this one that cuts the first connection off after so many bytes of the server, and how many
-/// have come of it over all connections.
+/// The address of a proxy of this one that cuts the first connection off after so many bytes of the server, and how
+/// many have come of it over all connections.
 pub async fn cutting(address: SocketAddr, after: usize) -> (String, Arc<AtomicUsize>) {
     let listener = TcpListener::bind("127.0.0.1:0").await.expect("a port");
     let url = format!("http://{}", listener.local_addr().expect("an address"));
