@@ -125,9 +125,13 @@ pub fn join_rest(
     recorder: &mut Recorder,
 ) -> Result<(), Error> {
     let rest: Vec<usize> = (0..problem.views()).filter(|&view| model.poses[view].is_none()).collect();
+    if rest.is_empty() {
+        return Ok(());
+    }
     for component in model.components() {
         let views = model.of_component(component).len();
-        if rest.is_empty() || views == 0 {
+        // One that was merged into another meanwhile.
+        if views == 0 {
             continue;
         }
         register::join_again(problem, model, component, &GrowthOptions::LAST, &rest, trials, recorder)?;

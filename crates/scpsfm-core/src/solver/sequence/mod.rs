@@ -93,7 +93,6 @@ pub fn solve(problem: &mut Problem, recorder: &mut Recorder) -> Result<Ended, Er
 /// The blocks of an input, and what their first search, calibration and metric extension came to.
 struct QuickPass {
     blocks: Blocks,
-    is_quick: bool,
     /// Breaks where nothing else needs to be tried.
     result: ControlFlow<Ended, Ended>,
 }
@@ -101,11 +100,8 @@ struct QuickPass {
 impl QuickPass {
     fn new(problem: &Problem, recorder: &mut Recorder) -> Result<Self, Error> {
         let blocks = Blocks::of(problem);
-        // In the one block of a whole input depths decide in the first round or take all of them. Other blocks are
-        // several, of which another may do.
-        let is_quick = !(blocks.is_whole && problem.input.has_depths());
-        let result = blocks.by_calibration(problem, is_quick, recorder)?;
-        Ok(Self { blocks, is_quick, result })
+        let result = blocks.by_calibration(problem, blocks.begin_quickly(problem), recorder)?;
+        Ok(Self { blocks, result })
     }
 
     fn result(&self) -> &Ended {
@@ -125,7 +121,8 @@ impl QuickPass {
     /// # Errors
     /// [`Error::Stopped`]; [`Error::Internal`] for defects.
     fn finish(self, problem: &Problem, recorder: &mut Recorder) -> Result<Ended, Error> {
-        let Self { blocks, is_quick, result } = self;
+        let Self { blocks, result } = self;
+        let is_quick = blocks.begin_quickly(problem);
         // A calibrated reconstruction that another might be better than.
         let mut metric: Option<Box<Extended>> = None;
         let first = match result {
@@ -276,6 +273,12 @@ impl Blocks {
             Some(whole) => Self { sets: vec![whole], is_whole: true },
             None => Self { sets: view_selection::blocks(problem), is_whole: false },
         }
+    }
+
+    /// Whether the first search does not try everything. In the one block of a whole input depths decide in the first
+    /// round or take all of them. Other blocks are several, of which another may do.
+    fn begin_quickly(&self, problem: &Problem) -> bool {
+        !(self.is_whole && problem.input.has_depths())
     }
 
     /// Calibrates the blocks and extends them from there; breaks where nothing else needs to be tried.
