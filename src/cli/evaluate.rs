@@ -4,28 +4,25 @@ use std::collections::BTreeSet;
 use std::path::{Path, PathBuf};
 
 use clap::ValueEnum;
-use serde_json::json;
-use sha2::{Digest, Sha256};
+use serde_json::{Value, json};
 
 use super::args::cores;
 use super::evaluate_choices::{ContestantArg, DepthsArg, SweepArg};
 use super::evaluate_long::{self, LongArgs};
 use super::evaluate_observations::{self, ObservationArgs};
 use super::evaluate_photographed::{self, PhotographedArgs};
-use super::evaluate_priors::{self, PriorArgs, Work};
+use super::evaluate_priors::{self, PriorArgs};
 use super::evaluate_real::{self, RealArgs};
+use super::evaluate_suite::{SceneFilter, SuiteRunner};
 use super::exit::{self, Exit, Failure};
-use super::interrupt::Interrupt;
-use super::print;
 use super::prior_file::PriorFileArgs;
-use super::progress::RunsView;
-use crate::domain::{Sha256Digest, SolveSettings, StopToken};
-use crate::evaluation::plan::{Contestant, Depths, Plan};
-use crate::evaluation::records;
+use crate::domain::SolveSettings;
+use crate::evaluation::plan::{Contestant, Depths, Plan, Run};
 use crate::evaluation::runner::{self, Records};
 use crate::evaluation::summary::{self, Cell};
 use crate::evaluation::{Sweep, figures, page};
-use crate::formats::publish::{create_directory, pretty, write_atomically};
+use crate::formats::publish::write_atomically;
+use crate::synthetic::SceneOptions;
 
 /// Seeds of a full evaluation and of a quick one.
 const SEEDS: u64 = 20;
@@ -33,9 +30,6 @@ const QUICK_SEEDS: u64 = 4;
 /// Observations of a scene up to which a quick evaluation solves it: a second or two each, with the paper's network
 /// too.
 const QUICK_OBSERVATIONS: usize = 5_000;
-
-/// What an interrupted evaluation says.
-pub(super) const GOES_ON: &str = "interrupted; called again with the same --out it goes on";
 
 const EXAMPLES: &str = "\
 Examples:
@@ -124,6 +118,9 @@ pub struct Args {
     pub quiet: bool,
 
     #[command(flatten)]
+    pub scenes: SceneFilter,
+
+    #[command(flatten)]
     pub prior: PriorFileArgs,
 
     #[command(flatten)]
@@ -206,77 +203,49 @@ pub async fn run(args: Args) -> Result<Exit, Failure> {
     args.prior.install()?;
     let threads = args.threads.map_or_else(cores, usize::from);
     let seeds = args.seeds.unwrap_or(SEEDS);
-    let work = Work { out: &args.out, threads, quiet: args.quiet, json: args.json };
-    let scenes = args.priors.texts();
+    let suite = SuiteRunner { out: &args.out, threads, quiet: args.quiet, json: args.json };
+    let scenes = args.scenes.texts();
     if args.observations.observations {
-        return evaluate_observations::run(&scenes, seeds, args.real.peer_words()?, &work);
+        return evaluate_observations::run(&scenes, seeds, args.real.peer_words()?, &suite);
     }
     if args.photographed.photographed {
         let seeds = args.seeds.unwrap_or(evaluate_photographed::SEEDS);
-        return evaluate_photographed::run(&scenes, seeds, args.real.peer_words()?, &work);
+        return evaluate_photographed::run(&scenes, seeds, args.real.peer_words()?, &suite);
     }
     if args.long.long {
         // One after the other: the memory is that of one solve.
         let seeds = args.seeds.unwrap_or(evaluate_long::SEEDS);
-        return evaluate_long::run(&scenes, seeds, &Work { threads: 1, ..work });
+        return evaluate_long::run(&scenes, seeds, &SuiteRunner { threads: 1, ..suite });
     }
     if args.priors.priors {
-        return evaluate_priors::run(&args.priors, seeds, &work);
+        return evaluate_priors::run(&args.priors, &scenes, seeds, &suite);
     }
     let plan = args.plan();
     let runs = plan.runs();
     if runs.is_empty() {
         return Err(Failure::usage("no method has anything to say of these sweeps and depths: give others"));
     }
-    create_directory(&args.out)?;
-    let mut records = Records::open(&args.out, runner::RECORDS, &build()?)?;
-    let missing = runs.iter().filter(|run| records.get(run).is_none()).count();
-    let bar = RunsView::new(args.quiet, runs.len(), runs.len() - missing);
-    let stop = StopToken::default();
-    let interrupt = Interrupt::listen()?;
-    let relay = interrupt.stops(&stop);
-    let outcome = tokio::task::block_in_place(|| {
-        records.run(&runs, threads, &stop, &|run| runner::measure(run, &stop), &mut |run| {
-            let scene = &run.scene;
-            bar.show(format!(
-                "{}: {} views, {} tracks, {} outliers, {} noise",
-                run.contestant.name(),
-                scene.views,
-                scene.tracks,
-                scene.outliers,
-                scene.noise
-            ));
-            bar.finished();
-        })
-    });
-    relay.abort();
-    bar.finish();
-    outcome?;
-    let cells = summary::cells(&plan, &records);
-    let summary = write_summary(&args.out, &plan, &records, &cells)?;
-    print(if args.json { summary.trim_end().to_owned() } else { table(&cells) }.trim_end())?;
-    if stop.is_stopped() {
-        return Err(Failure::interrupted_with(GOES_ON));
-    }
-    Ok(Exit::Done)
+    suite.run(runner::RECORDS, &runs, runner::measure, describe, "summary.json", |records| {
+        let cells = summary::cells(&plan, records);
+        Ok((write_summary(&args.out, &plan, records, &cells)?, table(&cells)))
+    })
 }
 
-/// Writes the figures; returns the JSON.
-fn write_summary(out: &Path, plan: &Plan, records: &Records, cells: &[Cell]) -> Result<String, Failure> {
+/// A run in a line.
+fn describe(run: &Run) -> String {
+    let Run { contestant, scene, .. } = run;
+    let SceneOptions { views, tracks, outliers, noise, .. } = scene;
+    format!("{}: {views} views, {tracks} tracks, {outliers} outliers, {noise} noise", contestant.name())
+}
+
+/// Writes tables and figures; returns the JSON.
+fn write_summary(out: &Path, plan: &Plan, records: &Records, cells: &[Cell]) -> Result<Value, Failure> {
     let coverage: Vec<_> = plan
         .contestants
         .iter()
         .filter(|&&contestant| contestant != Contestant::Oracle)
         .filter_map(|&contestant| summary::coverage(plan, records, contestant))
         .collect();
-    let json = pretty(&json!({
-        "version": env!("CARGO_PKG_VERSION"),
-        "seeds": plan.seeds,
-        "paper_width": plan.paper_width,
-        "cells": cells,
-        "coverage": coverage,
-    }))?;
-    write_atomically(out, "summary.json", json.as_bytes())?;
     write_atomically(out, "summary.csv", summary::csv(cells).as_bytes())?;
     // Cells with names instead of values are in the tables.
     let has_figure = plan.sweeps.iter().any(|sweep| sweep.names.is_empty());
@@ -285,7 +254,7 @@ fn write_summary(out: &Path, plan: &Plan, records: &Records, cells: &[Cell]) -> 
         write_atomically(out, &name, figures::svg(plan, cells, depths).as_bytes())?;
     }
     write_atomically(out, "index.html", page::page(plan, cells, &coverage).as_bytes())?;
-    Ok(json)
+    Ok(json!({ "seeds": plan.seeds, "paper_width": plan.paper_width, "cells": cells, "coverage": coverage }))
 }
 
 /// Mean F1 and median focal error of every cell, in words.
@@ -312,28 +281,6 @@ fn table(cells: &[Cell]) -> String {
         ));
     }
     text
-}
-
-/// What tells this program from any other that might have written the records: its version, the digest of its file and
-/// that of the network it asks.
-pub(super) fn build() -> Result<String, Failure> {
-    let program = std::fs::read(std::env::current_exe()?)?;
-    let program = Sha256Digest(Sha256::digest(&program).into());
-    // Another network gives other figures.
-    let network = scpsfm_core::subspace::current_sha256();
-    Ok(format!("{} {program:.16} {network:.16}", env!("CARGO_PKG_VERSION")))
-}
-
-impl From<records::Error> for Failure {
-    fn from(error: records::Error) -> Self {
-        match error {
-            records::Error::Io { .. } | records::Error::Failed { .. } => Failure::internal(error),
-            records::Error::OtherBuild { .. }
-            | records::Error::Malformed { .. }
-            | records::Error::NotRecords { .. }
-            | records::Error::Busy { .. } => Failure::bad_input(error),
-        }
-    }
 }
 
 #[cfg(test)]

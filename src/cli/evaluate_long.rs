@@ -2,7 +2,7 @@
 
 use serde_json::json;
 
-use super::evaluate_priors::{Work, chosen};
+use super::evaluate_suite::{SuiteRunner, chosen};
 use super::exit::{Exit, Failure};
 use crate::evaluation::long::{self, Plan, RECORDS};
 use crate::evaluation::observations;
@@ -28,12 +28,19 @@ pub struct LongArgs {
 ///
 /// # Errors
 /// A text that no motion has in its name, as wrong usage; files that cannot be written, a defect of the solver.
-pub fn run(scenes: &[&str], seeds: u64, work: &Work) -> Result<Exit, Failure> {
+pub fn run(scenes: &[&str], seeds: u64, suite: &SuiteRunner) -> Result<Exit, Failure> {
     let plan = Plan { motions: chosen(MOTIONS.to_vec(), |motion| motion.name(), scenes)?, seeds };
-    work.run(RECORDS, &plan.runs(), observations::measure, "long.json", |records| {
-        let rows = plan.rows(records);
-        (json!({ "seeds": seeds, "rows": rows }), long::text(&rows))
-    })
+    suite.run(
+        RECORDS,
+        &plan.runs(),
+        observations::measure,
+        |_| String::new(),
+        "long.json",
+        |records| {
+            let rows = plan.rows(records);
+            Ok((json!({ "seeds": seeds, "rows": rows }), long::text(&rows)))
+        },
+    )
 }
 
 #[cfg(test)]
@@ -43,8 +50,8 @@ mod tests {
     #[test]
     fn a_text_without_motions_names_those_that_there_are() {
         let directory = tempfile::tempdir().expect("a temporary directory");
-        let work = Work { out: directory.path(), threads: 1, quiet: true, json: false };
-        let failure = run(&["zeppelin"], 1, &work).expect_err("no such motion");
+        let suite = SuiteRunner { out: directory.path(), threads: 1, quiet: true, json: false };
+        let failure = run(&["zeppelin"], 1, &suite).expect_err("no such motion");
         assert_eq!(failure.exit, Exit::Usage);
         assert!(
             failure.message.contains("--scenes zeppelin: no scenes have it in their name; there are drive; corridor"),

@@ -2,7 +2,7 @@
 
 use serde_json::json;
 
-use super::evaluate_priors::{Work, chosen};
+use super::evaluate_suite::{SuiteRunner, chosen};
 use super::exit::{Exit, Failure};
 use crate::evaluation::observations::{self, Plan, conditions, table};
 
@@ -19,10 +19,17 @@ pub struct ObservationArgs {
 }
 
 /// Runs the command on the inputs of these names.
-pub fn run(scenes: &[&str], seeds: u64, peer: Vec<String>, work: &Work) -> Result<Exit, Failure> {
+pub fn run(scenes: &[&str], seeds: u64, peer: Vec<String>, suite: &SuiteRunner) -> Result<Exit, Failure> {
     let plan = Plan { conditions: chosen(conditions::all(), |condition| &condition.name, scenes)?, seeds, peer };
-    work.run(observations::RECORDS, &plan.runs(), observations::measure, "observations.json", |records| {
-        let rows = plan.rows(records);
-        (json!({ "seeds": plan.seeds, "peer": plan.peer, "rows": rows }), table::text(&rows))
-    })
+    suite.run(
+        observations::RECORDS,
+        &plan.runs(),
+        observations::measure,
+        |_| String::new(),
+        "observations.json",
+        |records| {
+            let rows = plan.rows(records);
+            Ok((json!({ "seeds": plan.seeds, "peer": plan.peer, "rows": rows }), table::text(&rows)))
+        },
+    )
 }

@@ -2,7 +2,7 @@
 
 use serde_json::json;
 
-use super::evaluate_priors::Work;
+use super::evaluate_suite::SuiteRunner;
 use super::exit::{Exit, Failure};
 use crate::evaluation::observations;
 use crate::evaluation::photographed::{Plan, RECORDS, table};
@@ -29,7 +29,7 @@ pub struct PhotographedArgs {
 ///
 /// # Errors
 /// A text that no scene has in its name, as wrong usage; files that cannot be written, a defect of the solver.
-pub fn run(scenes: &[&str], seeds: u64, peer: Vec<String>, work: &Work) -> Result<Exit, Failure> {
+pub fn run(scenes: &[&str], seeds: u64, peer: Vec<String>, suite: &SuiteRunner) -> Result<Exit, Failure> {
     let plan = Plan::new(seeds, scenes, peer);
     let names = plan.names();
     if let Some(text) = scenes.iter().find(|text| !names.iter().any(|name| name.contains(**text))) {
@@ -39,11 +39,18 @@ pub fn run(scenes: &[&str], seeds: u64, peer: Vec<String>, work: &Work) -> Resul
             Plan::new(1, &[], Vec::new()).names().join(", ")
         )));
     }
-    work.run(RECORDS, &plan.runs(), observations::measure, "photographed.json", |records| {
-        let tables = plan.tables(records);
-        let json = json!({ "seeds": seeds, "scenes": names.len(), "peer": plan.peer, "tables": tables });
-        (json, table::text(&tables))
-    })
+    suite.run(
+        RECORDS,
+        &plan.runs(),
+        observations::measure,
+        |_| String::new(),
+        "photographed.json",
+        |records| {
+            let tables = plan.tables(records);
+            let json = json!({ "seeds": seeds, "scenes": names.len(), "peer": plan.peer, "tables": tables });
+            Ok((json, table::text(&tables)))
+        },
+    )
 }
 
 #[cfg(test)]
@@ -53,8 +60,8 @@ mod tests {
     #[test]
     fn a_text_without_photographed_scenes_names_the_flag() {
         let directory = tempfile::tempdir().expect("a temporary directory");
-        let work = Work { out: directory.path(), threads: 1, quiet: true, json: false };
-        let failure = run(&["orbit", "zeppelin"], 50, Vec::new(), &work).expect_err("no such scene");
+        let suite = SuiteRunner { out: directory.path(), threads: 1, quiet: true, json: false };
+        let failure = run(&["orbit", "zeppelin"], 50, Vec::new(), &suite).expect_err("no such scene");
         assert_eq!(failure.exit, Exit::Usage);
         assert!(failure.message.contains("--scenes zeppelin"), "{failure}");
     }

@@ -25,6 +25,7 @@ pub mod evaluate_observations;
 pub mod evaluate_photographed;
 mod evaluate_priors;
 pub mod evaluate_real;
+pub mod evaluate_suite;
 pub mod exit;
 pub mod get;
 pub mod inputs;
