@@ -29,7 +29,7 @@ pub struct LongArgs {
 /// # Errors
 /// A text that no motion has in its name, as wrong usage; files that cannot be written, a defect of the solver.
 pub fn run(scenes: &[&str], seeds: u64, suite: &SuiteRunner) -> Result<Exit, Failure> {
-    let plan = Plan { motions: chosen(MOTIONS.to_vec(), |motion| motion.name(), scenes)?, seeds };
+    let plan = Plan { motions: chosen(MOTIONS.to_vec(), |motion| motion.name().to_owned(), scenes, None)?, seeds };
     suite.run(
         RECORDS,
         &plan.runs(),

@@ -20,7 +20,8 @@ pub struct ObservationArgs {
 
 /// Runs the command on the inputs of these names.
 pub fn run(scenes: &[&str], seeds: u64, peer: Vec<String>, suite: &SuiteRunner) -> Result<Exit, Failure> {
-    let plan = Plan { conditions: chosen(conditions::all(), |condition| &condition.name, scenes)?, seeds, peer };
+    let plan =
+        Plan { conditions: chosen(conditions::all(), |condition| condition.name.clone(), scenes, None)?, seeds, peer };
     suite.run(
         observations::RECORDS,
         &plan.runs(),

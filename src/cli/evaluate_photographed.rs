@@ -2,10 +2,11 @@
 
 use serde_json::json;
 
-use super::evaluate_suite::SuiteRunner;
+use super::evaluate_suite::{SuiteRunner, chosen};
 use super::exit::{Exit, Failure};
 use crate::evaluation::observations;
-use crate::evaluation::photographed::{Plan, RECORDS, table};
+use crate::evaluation::photographed::{self, Plan, RECORDS, table};
+use crate::synthetic::PhotographedOptions;
 
 /// Seeds where none are asked for.
 pub const SEEDS: u64 = 300;
@@ -30,15 +31,10 @@ pub struct PhotographedArgs {
 /// # Errors
 /// A text that no scene has in its name, as wrong usage; files that cannot be written, a defect of the solver.
 pub fn run(scenes: &[&str], seeds: u64, peer: Vec<String>, suite: &SuiteRunner) -> Result<Exit, Failure> {
-    let plan = Plan::new(seeds, scenes, peer);
-    let names = plan.names();
-    if let Some(text) = scenes.iter().find(|text| !names.iter().any(|name| name.contains(**text))) {
-        return Err(Failure::usage(format!(
-            "--scenes {text}: none of the {seeds} scenes has it in its name; names are \
-             motion/lens/focal-length/visibility/wrong, such as {}",
-            Plan::new(1, &[], Vec::new()).names().join(", ")
-        )));
-    }
+    let words = photographed::words();
+    let there_are = format!("those of the first {seeds} seeds (--seeds), whose names join with / {words}");
+    let all = photographed::scenes(seeds);
+    let plan = Plan { scenes: chosen(all, PhotographedOptions::name, scenes, Some(there_are))?, peer };
     suite.run(
         RECORDS,
         &plan.runs(),
@@ -47,7 +43,7 @@ pub fn run(scenes: &[&str], seeds: u64, peer: Vec<String>, suite: &SuiteRunner) 
         "photographed.json",
         |records| {
             let tables = plan.tables(records);
-            let json = json!({ "seeds": seeds, "scenes": names.len(), "peer": plan.peer, "tables": tables });
+            let json = json!({ "seeds": seeds, "scenes": plan.scenes.len(), "peer": plan.peer, "tables": tables });
             Ok((json, table::text(&tables)))
         },
     )
@@ -58,11 +54,13 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_text_without_photographed_scenes_names_the_flag() {
+    fn a_text_without_photographed_scenes_names_those_that_there_are() {
         let directory = tempfile::tempdir().expect("a temporary directory");
         let suite = SuiteRunner { out: directory.path(), threads: 1, quiet: true, json: false };
         let failure = run(&["orbit", "zeppelin"], 50, Vec::new(), &suite).expect_err("no such scene");
         assert_eq!(failure.exit, Exit::Usage);
-        assert!(failure.message.contains("--scenes zeppelin"), "{failure}");
+        let known =
+            ["--scenes zeppelin", "first 50 seeds", "motion (orbit, walk-around", "action-camera", "wrong-link"];
+        assert!(known.iter().all(|word| failure.message.contains(word)), "{failure}");
     }
 }

@@ -29,7 +29,7 @@ pub struct PriorArgs {
 
 /// Runs the command.
 pub fn run(args: &PriorArgs, texts: &[&str], seeds: u64, suite: &SuiteRunner) -> Result<Exit, Failure> {
-    let conditions = chosen(scenes::all(), |condition| condition.name, texts)?;
+    let conditions = chosen(scenes::all(), |condition| condition.name.to_owned(), texts, None)?;
     if args.sweep {
         let runs = sweep::runs(&conditions, seeds);
         return suite.run(

@@ -21,7 +21,7 @@ use scpsfm_core::subspace;
 #[derive(Debug, Clone, clap::Args)]
 pub struct SceneFilter {
     /// The scenes of these names, or all whose names hold these texts, separated by commas; a comma before a space is
-    /// part of a name [default: all]
+    /// part of a name. With --photographed, of the scenes of the first --seeds seeds [default: all]
     #[arg(long, value_name = "TEXTS", requires = "suite", conflicts_with = "real")]
     scenes: Option<String>,
 }
@@ -43,14 +43,21 @@ impl SceneFilter {
 
 /// The scenes of these names, or all whose names hold these texts; without a text all.
 ///
+/// * `there_are`: what a refusal says that names hold, where listing all of them says too much
+///
 /// # Errors
 /// A text that no scene has in its name, as wrong usage.
-pub fn chosen<T>(mut all: Vec<T>, name: fn(&T) -> &str, texts: &[&str]) -> Result<Vec<T>, Failure> {
-    let names: Vec<&str> = all.iter().map(name).collect();
-    let exact = |text: &str| names.contains(&text);
+pub fn chosen<T>(
+    mut all: Vec<T>,
+    name: impl Fn(&T) -> String,
+    texts: &[&str],
+    there_are: Option<String>,
+) -> Result<Vec<T>, Failure> {
+    let names: Vec<String> = all.iter().map(name).collect();
+    let exact = |text: &str| names.iter().any(|name| name == text);
     let is_of = |name: &str, text: &str| if exact(text) { name == text } else { name.contains(text) };
     if let Some(text) = texts.iter().find(|text| !names.iter().any(|name| is_of(name, text))) {
-        let there_are = names.join("; ");
+        let there_are = there_are.unwrap_or_else(|| names.join("; "));
         return Err(Failure::usage(format!("--scenes {text}: no scenes have it in their name; there are {there_are}")));
     }
     let wanted: Vec<bool> =
@@ -146,5 +153,24 @@ impl From<records::Error> for Failure {
             | records::Error::NotRecords { .. }
             | records::Error::Busy { .. } => Failure::bad_input(error),
         }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn chosen_of(texts: &[&str]) -> Result<Vec<&'static str>, Failure> {
+        chosen(vec!["orbit", "orbit/fisheye", "drive/fisheye", "drive"], |name| name.to_string(), texts, None)
+    }
+
+    #[test]
+    fn a_whole_name_is_that_scene_and_a_part_all_that_hold_it() {
+        assert_eq!(chosen_of(&[]).expect("all").len(), 4);
+        assert_eq!(chosen_of(&["orbit"]).expect("one"), ["orbit"]);
+        assert_eq!(chosen_of(&["fish"]).expect("two"), ["orbit/fisheye", "drive/fisheye"]);
+        assert_eq!(chosen_of(&["drive", "orbit"]).expect("two"), ["orbit", "drive"]);
+        let failure = chosen_of(&["drive", "zeppelin"]).expect_err("no such scene");
+        assert!(failure.message.contains("zeppelin") && failure.message.contains("orbit; orbit/fisheye"), "{failure}");
     }
 }

@@ -13,6 +13,7 @@ use crate::evaluation::observations::{Measured, Records, Run};
 use crate::evaluation::real::Side;
 use crate::evaluation::summary::mean;
 use crate::synthetic::PhotographedOptions;
+use crate::synthetic::photographed::{FocalKind, LensKind, PhotographedMotion, VisibilityKind, WrongKind};
 
 /// First seed: above those of the other evaluations.
 const FIRST_SEED: u64 = 800_000;
@@ -39,27 +40,33 @@ const AXES: [Axis; 6] = [
     ("visibility", |options| options.visibility.name()),
 ];
 
+/// The scenes of so many seeds.
+pub fn scenes(seeds: u64) -> Vec<PhotographedOptions> {
+    (FIRST_SEED..FIRST_SEED + seeds).map(PhotographedOptions::drawn).collect()
+}
+
+/// The words that names of scenes consist of, in their order.
+pub fn words() -> String {
+    let motions = PhotographedMotion::ALL.map(PhotographedMotion::name).join(", ");
+    let lenses = LensKind::ALL.map(LensKind::name).join(", ");
+    let focals = FocalKind::ALL.map(FocalKind::name).join(", ");
+    let visibilities = VisibilityKind::ALL.map(VisibilityKind::name).join(", ");
+    let wrong = WrongKind::ALL.map(WrongKind::name).join(", ");
+    format!(
+        "motion ({motions}), lens ({lenses}), focal length ({focals}), visibility ({visibilities}) and what is wrong \
+         ({wrong})"
+    )
+}
+
 /// What to run.
 #[derive(Debug, Clone)]
 pub struct Plan {
-    scenes: Vec<PhotographedOptions>,
+    pub scenes: Vec<PhotographedOptions>,
     /// The other program and its first arguments; empty: none.
     pub peer: Vec<String>,
 }
 
 impl Plan {
-    /// The scenes of so many seeds, of these the ones whose name holds one of the texts; without a text all.
-    pub fn new(seeds: u64, texts: &[&str], peer: Vec<String>) -> Self {
-        let scenes = (FIRST_SEED..FIRST_SEED + seeds).map(PhotographedOptions::drawn);
-        let is_wanted = |name: &str| texts.is_empty() || texts.iter().any(|text| name.contains(text));
-        Self { scenes: scenes.filter(|options| is_wanted(&options.name())).collect(), peer }
-    }
-
-    /// Their names.
-    pub fn names(&self) -> Vec<String> {
-        self.scenes.iter().map(PhotographedOptions::name).collect()
-    }
-
     /// Every scene for every side, scene by scene, so that a stopped evaluation has a balanced part of them.
     pub fn runs(&self) -> Vec<Run> {
         self.scenes.iter().flat_map(|options| self.sides().filter_map(|side| self.run(options, side))).collect()
