@@ -225,9 +225,9 @@ pub async fn run(args: Args) -> Result<Exit, Failure> {
     if runs.is_empty() {
         return Err(Failure::usage("no method has anything to say of these sweeps and depths: give others"));
     }
-    suite.run(runner::RECORDS, &runs, runner::measure, describe, "summary.json", |records| {
+    suite.run(runner::RECORDS, &runs, runner::measure, describe, "summary.json", |records, note| {
         let cells = summary::cells(&plan, records);
-        Ok((write_summary(&args.out, &plan, records, &cells)?, table(&cells)))
+        Ok((write_summary(&args.out, &plan, records, &cells, note)?, table(&cells)))
     })
 }
 
@@ -238,8 +238,14 @@ fn describe(run: &Run) -> String {
     format!("{}: {views} views, {tracks} tracks, {outliers} outliers, {noise} noise", contestant.name())
 }
 
-/// Writes tables and figures; returns the JSON.
-fn write_summary(out: &Path, plan: &Plan, records: &Records, cells: &[Cell]) -> Result<Value, Failure> {
+/// Writes tables and figures; returns the JSON. `note`: what there is to say of runs that are missing.
+fn write_summary(
+    out: &Path,
+    plan: &Plan,
+    records: &Records,
+    cells: &[Cell],
+    note: Option<&str>,
+) -> Result<Value, Failure> {
     let coverage: Vec<_> = plan
         .contestants
         .iter()
@@ -253,7 +259,7 @@ fn write_summary(out: &Path, plan: &Plan, records: &Records, cells: &[Cell]) -> 
         let name = format!("figure-depths-{}.svg", depths.name());
         write_atomically(out, &name, figures::svg(plan, cells, depths).as_bytes())?;
     }
-    write_atomically(out, "index.html", page::page(plan, cells, &coverage).as_bytes())?;
+    write_atomically(out, "index.html", page::page(plan, cells, &coverage, note).as_bytes())?;
     Ok(json!({ "seeds": plan.seeds, "paper_width": plan.paper_width, "cells": cells, "coverage": coverage }))
 }
 

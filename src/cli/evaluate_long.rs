@@ -36,7 +36,7 @@ pub fn run(scenes: &[&str], seeds: u64, suite: &SuiteRunner) -> Result<Exit, Fai
         observations::measure,
         |_| String::new(),
         "long.json",
-        |records| {
+        |records, _| {
             let rows = plan.rows(records);
             Ok((json!({ "seeds": seeds, "rows": rows }), long::text(&rows)))
         },

@@ -28,7 +28,7 @@ pub fn run(scenes: &[&str], seeds: u64, peer: Vec<String>, suite: &SuiteRunner) 
         observations::measure,
         |_| String::new(),
         "observations.json",
-        |records| {
+        |records, _| {
             let rows = plan.rows(records);
             Ok((json!({ "seeds": plan.seeds, "peer": plan.peer, "rows": rows }), table::text(&rows)))
         },

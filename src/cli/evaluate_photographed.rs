@@ -41,7 +41,7 @@ pub fn run(scenes: &[&str], seeds: u64, peer: Vec<String>, suite: &SuiteRunner) 
         observations::measure,
         |_| String::new(),
         "photographed.json",
-        |records| {
+        |records, _| {
             let tables = plan.tables(records);
             let json = json!({ "seeds": seeds, "scenes": plan.scenes.len(), "peer": plan.peer, "tables": tables });
             Ok((json, table::text(&tables)))

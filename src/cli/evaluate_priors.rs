@@ -38,7 +38,7 @@ pub fn run(args: &PriorArgs, texts: &[&str], seeds: u64, suite: &SuiteRunner) ->
             sweep::measure,
             |_| String::new(),
             "sweep.json",
-            |records| {
+            |records, _| {
                 let rows = sweep::rows(&conditions, seeds, records);
                 let json = json!({ "seeds": seeds, "costs_per_nat": sweep::COSTS_PER_NAT, "rows": rows });
                 Ok((json, sweep::text(&rows)))
@@ -52,7 +52,7 @@ pub fn run(args: &PriorArgs, texts: &[&str], seeds: u64, suite: &SuiteRunner) ->
         priors::measure,
         |_| String::new(),
         "priors.json",
-        |records| {
+        |records, _| {
             let rows = plan.rows(records);
             Ok((json!({ "seeds": seeds, "rows": rows }), table::text(&rows)))
         },

@@ -81,7 +81,7 @@ impl SuiteRunner<'_> {
     ///
     /// * `describe`: what the progress says of a finished run
     /// * `file`: that of the figures
-    /// * `figures`: as JSON and as a table
+    /// * `figures`: as JSON and as a table, told what there is to note of runs that are missing
     ///
     /// # Errors
     /// Files that cannot be read or written, a defect of the solver; interrupted, after the figures so far were given.
@@ -92,7 +92,7 @@ impl SuiteRunner<'_> {
         measure: fn(&R, &StopToken) -> Result<Option<M>, String>,
         describe: fn(&R) -> String,
         file: &str,
-        figures: impl FnOnce(&Records<R, M>) -> Result<(Value, String), Failure>,
+        figures: impl FnOnce(&Records<R, M>, Option<&str>) -> Result<(Value, String), Failure>,
     ) -> Result<Exit, Failure>
     where
         R: Serialize + DeserializeOwned + Sync,
@@ -114,14 +114,27 @@ impl SuiteRunner<'_> {
         relay.abort();
         bar.finish();
         outcome?;
-        let (json, table) = figures(&records)?;
+        let done = runs.iter().filter(|run| records.get(run).is_some()).count();
+        let note = incomplete(done, runs.len());
+        let (mut json, table) = figures(&records, note.as_deref())?;
+        json["complete"] = json!(note.is_none());
         let json = written(self.out, file, json)?;
-        print(if self.json { &json } else { &table }.trim_end())?;
+        print(&if self.json { json.trim_end().to_owned() } else { with_note(table, note) })?;
         if stop.is_stopped() {
             return Err(Failure::interrupted_with("interrupted; called again with the same --out it goes on"));
         }
         Ok(Exit::Done)
     }
+}
+
+/// What figures say of an evaluation whose runs are not all done.
+pub fn incomplete(done: usize, runs: usize) -> Option<String> {
+    (done < runs).then(|| format!("Incomplete: {done} of {runs} runs are done."))
+}
+
+/// A table and below it what there is to note.
+pub fn with_note(table: String, note: Option<String>) -> String {
+    [Some(table.trim_end().to_owned()), note].into_iter().flatten().collect::<Vec<_>>().join("\n\n")
 }
 
 /// Writes figures with the version and the network that they are of; returns the JSON.

@@ -12,10 +12,14 @@ background:#fff}table{border-collapse:collapse;font-size:13px}td,th{padding:.15r
 border-bottom:1px solid #ddd}td:nth-child(-n+4),th:nth-child(-n+4){text-align:left}figure{margin:1.5rem 0;overflow-x:auto}\
 svg{min-width:70rem;width:100%}caption{text-align:left;padding:.5rem 0}";
 
-/// The page; nothing is fetched from anywhere.
-pub fn page(plan: &Plan, cells: &[Cell], coverage: &[Coverage]) -> String {
-    let mut body = String::from(
-        "<h1>Evaluation</h1>\n<p>Every method on the same scenes, against an oracle that knows the truth. F1 is a mean \
+/// The page; nothing is fetched from anywhere. `note`: what there is to say of runs that are missing.
+pub fn page(plan: &Plan, cells: &[Cell], coverage: &[Coverage], note: Option<&str>) -> String {
+    let mut body = String::from("<h1>Evaluation</h1>\n");
+    if let Some(note) = note {
+        let _ = writeln!(body, "<p><strong>{}</strong></p>", escape(note));
+    }
+    body.push_str(
+        "<p>Every method on the same scenes, against an oracle that knows the truth. F1 is a mean \
          over the seeds; errors are medians over the seeds that have one. 2D error: root mean square distance of the \
          reprojections from the true image points. 3D error: mean relative distance after the best similarity. Focal \
          error: |ln(f / f true)|. Of psfm, F1 is that of the best threshold.",

@@ -107,6 +107,8 @@ fn priors_are_compared_in_a_table_and_a_file() {
     let written = fs::read_to_string(directory.path().join("priors.json")).expect("priors.json");
     let written: Value = serde_json::from_str(&written).expect("JSON");
     let rows = written["rows"]["auto"].as_array().expect("rows");
+    assert_eq!(written["complete"], true, "{written}");
+    assert!(!compared.stdout.contains("Incomplete"), "{compared:?}");
     assert!(rows.len() == 2 && rows.iter().all(|row| row["seeds"] == 1), "{written}");
     let lines = || fs::read_to_string(directory.path().join("priors.jsonl")).expect("records").lines().count();
     assert_eq!(lines(), 2, "a header and a scene");
@@ -116,24 +118,33 @@ fn priors_are_compared_in_a_table_and_a_file() {
     assert!(unknown.code == Some(2) && unknown.stderr.contains("outliers .9"), "{unknown:?}");
 }
 
-/// Several scenes make a list, each run has a line where stderr is no terminal, and what was asked for as JSON is JSON.
+/// Several scenes make a list, each run has a line where stderr is no terminal, what was asked for as JSON is JSON, and
+/// either says that runs are missing.
 #[test]
-fn an_interrupted_comparison_prints_json() {
+fn an_interrupted_comparison_says_what_it_has() {
     let directory = tempfile::tempdir().expect("a temporary directory");
     let scenes = ["--scenes", "outliers .9,any roll, .97", "--seeds", "1000"];
-    let how = ["--threads", "1", "--json", "--out", text(directory.path())];
-    let mut command = program(["evaluate", "--priors", "--auto-only"].iter().chain(&scenes).chain(&how));
-    let mut running = Running(command.stdout(Stdio::piped()).stderr(Stdio::piped()).spawn().expect("started"));
-    let mut lines = BufReader::new(running.0.stderr.take().expect("stderr")).lines();
-    let first = lines.next().expect("a line").expect("text");
+    let how = ["--threads", "1", "--out", text(directory.path())];
+    let interrupted = |more: &[&str]| {
+        let mut command =
+            program(["evaluate", "--priors", "--auto-only"].iter().chain(&scenes).chain(&how).chain(more));
+        let mut running = Running(command.stdout(Stdio::piped()).stderr(Stdio::piped()).spawn().expect("started"));
+        let mut lines = BufReader::new(running.0.stderr.take().expect("stderr")).lines();
+        let first = lines.next().expect("a line").expect("text");
+        running.signal(Signal::INT);
+        let mut stdout = String::new();
+        running.0.stdout.take().expect("stdout").read_to_string(&mut stdout).expect("text");
+        assert_eq!(running.wait().code(), Some(130), "{stdout}");
+        (first, stdout)
+    };
+    let (first, stdout) = interrupted(&["--json"]);
     assert!(first.starts_with("1/2000 runs, "), "{first}");
-    running.signal(Signal::INT);
-    let mut stdout = String::new();
-    running.0.stdout.take().expect("stdout").read_to_string(&mut stdout).expect("text");
-    assert_eq!(running.wait().code(), Some(130), "{stdout}");
     let printed: Value = serde_json::from_str(&stdout).expect("JSON");
     let rows = printed["rows"]["auto"].as_array().expect("rows");
     assert!(rows.iter().any(|row| row["condition"] == "outliers .9"), "{printed}");
+    assert_eq!(printed["complete"], false, "{printed}");
     let written = fs::read_to_string(directory.path().join("priors.json")).expect("priors.json");
     assert_eq!(written.trim_end(), stdout.trim_end());
+    let (_, table) = interrupted(&[]);
+    assert!(table.contains("Incomplete: ") && table.contains(" of 2000 runs are done."), "{table}");
 }

@@ -9,8 +9,9 @@ const STYLE: &str = "body{font:15px/1.5 system-ui,sans-serif;margin:2rem auto;ma
 background:#fff}div{overflow-x:auto}table{border-collapse:collapse;font-size:13px}td,th{padding:.15rem .6rem;\
 text-align:right;border-bottom:1px solid #ddd;white-space:nowrap}.words{text-align:left}";
 
-/// The page; nothing is fetched from anywhere. `peer`: the other program's command line, empty where there is none.
-pub fn page(rows: &[Row], peer: &[String]) -> String {
+/// The page; nothing is fetched from anywhere. `peer`: the other program's command line, empty where there is none;
+/// `note`: what there is to say of runs that are missing.
+pub fn page(rows: &[Row], peer: &[String], note: Option<&str>) -> String {
     let mut table = String::from("<table>\n<tr>");
     for heading in table::headings() {
         let _ = write!(table, "<th>{}</th>", escape(heading));
@@ -29,9 +30,10 @@ pub fn page(rows: &[Row], peer: &[String]) -> String {
         [] => String::new(),
         words => format!("<p>Peer: <code>{}</code></p>\n", escape(&words.join(" "))),
     };
+    let note = note.map_or_else(String::new, |note| format!("<p><strong>{}</strong></p>\n", escape(note)));
     format!(
         "<!doctype html>\n<html lang=\"en\">\n<head>\n<meta charset=\"utf-8\">\n<title>scpsfm on real sequences</title>\n\
-         <style>{STYLE}</style>\n</head>\n<body>\n<h1>Real sequences</h1>\n{peer}<p>Views: how many are registered, of how many, and in how many parts where \
+         <style>{STYLE}</style>\n</head>\n<body>\n<h1>Real sequences</h1>\n{note}{peer}<p>Views: how many are registered, of how many, and in how many parts where \
          there are several. Focal %: deviation from the known focal \
          length. Precision, recall and F1: over all observations against the labels, by the side's verdicts on \
          observations or on tracks. Mean and rms px: reprojection errors over what the side itself kept. Centres %: root \

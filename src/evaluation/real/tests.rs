@@ -272,7 +272,7 @@ fn names_stay_text_in_every_form() {
     assert!(line.starts_with("\"a,<b>\"\"c\",peer,9,40,") && line.ends_with(",\"<script>, no\""), "{line}");
     // Two commas of the line are within quotes.
     assert_eq!(line.matches(',').count() - 2, header.matches(',').count());
-    let html = page::page(std::slice::from_ref(&row), &["x<y".into()]);
+    let html = page::page(std::slice::from_ref(&row), &["x<y".into()], Some("Incomplete"));
     assert!(html.contains("a,&lt;b&gt;&quot;c") && html.contains("x&lt;y") && !html.contains("<script>"), "{html}");
     let text = table::text(&[row.clone(), Row { sequence: "longer than the other".into(), ..row }]);
     let place = |line: &str| line.find("peer").expect("the side");
