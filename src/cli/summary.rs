@@ -1,8 +1,9 @@
 //! A result in a few lines for people.
 
 use super::next_steps::{self, Files};
-use crate::domain::{Grade, Method, Solution, Status};
+use crate::domain::{Grade, Solution, Status};
 use crate::formats::result_json::{CameraGroupJson, SecondStructureCounts, camera_groups};
+use crate::formats::track_counts::TrackCounts;
 use crate::formats::{LabelledInput, result_files, second_structures, warnings};
 use crate::solver::VERIFIED;
 
@@ -32,27 +33,29 @@ pub fn text(solution: &Solution, input: Option<&LabelledInput>) -> String {
     if let Some((low, high)) = solution.view_focals_px() {
         fact("of views", format!("{low:.1} to {high:.1} px, one each; above is their geometric mean"));
     }
-    let tracks = solution.tracks.inlier.len();
+    let tracks = TrackCounts::new(solution, input);
     let observations = solution.observations.inlier.len();
     fact(
         "inliers",
         format!(
-            "{} of {tracks} tracks, {} of {observations} observations",
-            solution.inlier_track_count(),
+            "{} of {} tracks, {} of {observations} observations",
+            tracks.inlier,
+            solution.tracks.inlier.len(),
             solution.inlier_observation_count()
         ),
     );
-    let two_views = solution.two_view_tracks.len();
-    if two_views > 0 {
+    if tracks.two_view > 0 {
         let what = "tracks that two views of a part see are consistent with these; none is verified";
-        fact("two views", format!("{two_views} {what}"));
+        fact("two views", format!("{} {what}", tracks.two_view));
     }
-    match input.map_or(0, |input| unclassified(solution, input)) {
-        0 => {}
-        count => {
-            let tracks = if two_views > 0 { "other tracks" } else { "tracks" };
-            fact("unclassified", format!("{count} {tracks}: fewer than {VERIFIED} registered views see them"));
-        }
+    if let Some(count @ 1..) = tracks.unclassified {
+        let others = if tracks.two_view > 0 { "other tracks" } else { "tracks" };
+        fact("unclassified", format!("{count} {others}: fewer than {VERIFIED} registered views see them"));
+    }
+    if let Some(count @ 1..) = tracks.rejected {
+        let agreeing =
+            if solution.second_structures.is_empty() { "" } else { ", some of which agree on other motions" };
+        fact("rejected", format!("{count} tracks{agreeing}"));
     }
     for counts in second_structures::counts(solution) {
         fact(&format!("structure {} ", counts.number), structure(&counts));
@@ -82,22 +85,6 @@ pub fn text(solution: &Solution, input: Option<&LabelledInput>) -> String {
         lines.push(format!("  warning: {}: {}", warning.code.name(), warning.detail));
     }
     lines.join("\n")
-}
-
-/// Tracks that nothing is said of, as too few registered views see them; of a method that judges observations. Those
-/// that are consistent with two views are none of them.
-fn unclassified(solution: &Solution, input: &LabelledInput) -> usize {
-    if solution.status != Status::Solved || !matches!(solution.method, Method::Auto | Method::Geometry) {
-        return 0;
-    }
-    let mut seen = vec![0usize; solution.tracks.inlier.len()];
-    for (&view, &track) in input.raw.view.iter().zip(&input.raw.track) {
-        seen[track as usize] += usize::from(solution.views[view as usize].projection.is_some());
-    }
-    for track in &solution.two_view_tracks {
-        seen[track.track as usize] = VERIFIED;
-    }
-    seen.into_iter().filter(|&count| count < VERIFIED).count()
 }
 
 /// The same with where the files are and what to do next.
@@ -190,16 +177,20 @@ mod tests {
     }
 
     #[test]
-    fn tells_how_many_tracks_nothing_is_said_of() {
+    fn tells_how_many_tracks_have_which_verdict() {
         let (input, mut solution) = fixture::solved();
-        assert!(!text(&solution, Some(&input)).contains("unclassified"), "{}", text(&solution, Some(&input)));
+        let lines = text(&solution, Some(&input));
+        assert!(lines.contains("rejected     20 tracks\n") && !lines.contains("unclassified"), "{lines}");
+        assert!(!text(&solution, None).contains("rejected"), "without the input nobody knows who sees them");
         solution.views[..3].iter_mut().for_each(|view| view.projection = None);
         let lines = text(&solution, Some(&input));
-        assert!(lines.contains("unclassified 40 tracks: fewer than 3 registered views see them"), "{lines}");
-        solution.two_view_tracks = vec![TwoViewTrack { track: 7, weight: 0.75, part: 0, point: None }];
+        assert!(lines.contains("unclassified 20 tracks: fewer than 3 registered views see them"), "{lines}");
+        assert!(!lines.contains("rejected"), "{lines}");
+        let outlier = solution.tracks.inlier.iter().position(|inlier| !inlier).expect("an outlier") as u32;
+        solution.two_view_tracks = vec![TwoViewTrack { track: outlier, weight: 0.75, part: 0, point: None }];
         let lines = text(&solution, Some(&input));
         assert!(lines.contains("two views    1 tracks that two views of a part see"), "{lines}");
-        assert!(lines.contains("unclassified 39 other tracks: fewer than 3 registered views see them"), "{lines}");
+        assert!(lines.contains("unclassified 19 other tracks: fewer than 3 registered views see them"), "{lines}");
     }
 
     #[test]

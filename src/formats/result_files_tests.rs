@@ -64,6 +64,8 @@ fn the_fields_of_result_json_are_a_contract() {
         "inlier_observations",
         "split_points",
         "two_view_tracks",
+        "unclassified_tracks",
+        "rejected_tracks",
         "second_structures",
         "registered_views",
         "reprojection_rms_px",

@@ -6,6 +6,7 @@ use crate::domain::result::ProposalTime;
 use crate::domain::second_structure::SecondStructureKind;
 use crate::domain::{Calibration, Grade, LensProjection, Method, Solution, Status, Warning, WarningCode};
 
+use super::track_counts::TrackCounts;
 use super::{Label, LabelledInput, second_structures, warnings};
 
 /// The summary of a result.
@@ -52,6 +53,10 @@ pub struct ResultJson {
     pub split_points: usize,
     /// Tracks that two registered views of one part see and that are consistent with these.
     pub two_view_tracks: usize,
+    /// Tracks that too few registered views see for a verdict, and those that are wrong. Null: the
+    /// file was written without the input, or there is no reconstruction.
+    pub unclassified_tracks: Option<usize>,
+    pub rejected_tracks: Option<usize>,
     /// The rigid motions that `SECOND_STRUCTURE` reports, by number.
     pub second_structures: Vec<SecondStructureCounts>,
     pub registered_views: usize,
@@ -190,6 +195,7 @@ impl ResultJson {
     pub fn new(solution: &Solution, input: Option<&LabelledInput>) -> Self {
         let cameras = camera_groups(solution);
         let first = cameras.iter().find(|camera| camera.focal_px.is_some());
+        let tracks = TrackCounts::new(solution, input);
         Self {
             status: solution.status,
             grade: solution.grade,
@@ -213,10 +219,12 @@ impl ResultJson {
             sigma_tangential_p1: first.and_then(|camera| camera.sigma_tangential_p1),
             sigma_tangential_p2: first.and_then(|camera| camera.sigma_tangential_p2),
             plane_at_infinity: solution.plane_at_infinity,
-            inlier_tracks: solution.inlier_track_count(),
+            inlier_tracks: tracks.inlier,
             inlier_observations: solution.inlier_observation_count(),
             split_points: solution.splits.len(),
-            two_view_tracks: solution.two_view_tracks.len(),
+            two_view_tracks: tracks.two_view,
+            unclassified_tracks: tracks.unclassified,
+            rejected_tracks: tracks.rejected,
             second_structures: second_structures::counts(solution),
             registered_views: solution.registered_views().len(),
             reprojection_rms_px: solution.reprojection_rms_px,

@@ -46,7 +46,7 @@ const PART_COLOURS: u32 = 6;
 pub fn page(solution: &Solution, input: Option<&LabelledInput>) -> String {
     let counts = counts::of_views(solution, input);
     let body = [
-        sections::headline(solution),
+        sections::headline(solution, input),
         sections::warnings(solution, input),
         calibration::section(solution),
         space::section(solution, input),

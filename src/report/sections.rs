@@ -8,6 +8,7 @@ use super::words;
 use crate::domain::result::ProposalTime;
 use crate::domain::{Calibration, Grade, HeadProgress, LensProjection, Losses, Progress, Solution, Status};
 use crate::formats::LabelledInput;
+use crate::formats::track_counts::TrackCounts;
 use crate::formats::warnings::named;
 
 /// A focal length beyond this factor of the final one is drawn at the edge of its chart.
@@ -15,7 +16,7 @@ const FOCAL_CLIP: f64 = 2.5;
 const NETWORK_ITERATION: &str = "network iteration";
 
 /// Title, outcome and the figures that matter.
-pub fn headline(solution: &Solution) -> String {
+pub fn headline(solution: &Solution, input: Option<&LabelledInput>) -> String {
     let (badge, tone) = match (solution.status, solution.grade) {
         (Status::NoReconstruction, _) => ("NO_RECONSTRUCTION", "bad"),
         (_, Some(grade)) => (grade.name(), if grade == Grade::Metric { "good" } else { "fair" }),
@@ -45,12 +46,19 @@ pub fn headline(solution: &Solution) -> String {
     } else if solution.is_focal_unobservable() {
         card("focal length", "none".into(), "unobservable".into());
     }
+    let tracks = TrackCounts::new(solution, input);
     let observations = solution.observations.inlier.len();
     card(
         "inlier tracks",
-        format!("{} of {}", solution.inlier_track_count(), solution.tracks.inlier.len()),
+        format!("{} of {}", tracks.inlier, solution.tracks.inlier.len()),
         format!("{} of {observations} observations", solution.inlier_observation_count()),
     );
+    if let (Some(rejected), Some(unclassified)) = (tracks.rejected, tracks.unclassified) {
+        let others =
+            [(tracks.two_view, "of two views, consistent"), (unclassified, "unclassified: too few views see them")];
+        let others = others.iter().filter(|(count, _)| *count > 0).map(|(count, what)| format!("{count} {what}"));
+        card("rejected tracks", rejected.to_string(), others.collect::<Vec<_>>().join("; "));
+    }
     let registered = solution.registered_views().len();
     card("views", format!("{registered} of {}", solution.views.len()), "registered".into());
     if let Some(rms_px) = solution.reprojection_rms_px {
@@ -351,18 +359,18 @@ mod tests {
     #[test]
     fn distortions_that_are_0_have_no_card() {
         let (_, mut solution) = fixture::solved();
-        let html = headline(&solution);
+        let html = headline(&solution, None);
         assert!(html.contains("<dt>radial distortion</dt><dd>k1 -0.02</dd><p>estimated</p>"), "{html}");
         assert!(!html.contains("tangential"), "{html}");
         let calibration = &mut solution.calibrations[0];
         (calibration.radial_k3, calibration.tangential_p1, calibration.tangential_p2) = (0.25, 0.5, -0.125);
         calibration.sigmas = Sigmas { radial_k1: Some(0.004), radial_k3: Some(0.03), ..Sigmas::default() };
-        let html = headline(&solution);
+        let html = headline(&solution, None);
         assert!(html.contains("<dd>k1 -0.02, k3 0.25</dd><p>\u{b1} 0.004, \u{b1} 0.03 (one sigma)</p>"), "{html}");
         assert!(html.contains("<dt>tangential distortion</dt><dd>p1 0.5, p2 -0.125</dd><p>estimated</p>"), "{html}");
         solution.calibrations[0].radial_k1 = 0.0;
         solution.calibrations[0].radial_k3 = 0.0;
-        assert!(!headline(&solution).contains("radial distortion"));
+        assert!(!headline(&solution, None).contains("radial distortion"));
     }
 
     #[test]

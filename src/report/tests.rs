@@ -38,6 +38,7 @@ fn shows_every_part() {
     ] {
         assert!(page.contains(part), "no {part}");
     }
+    assert!(page.contains("<dt>rejected tracks</dt><dd>20</dd>"));
     let focal = format!("{:.1}", solution.calibrations[0].focal_px);
     assert!(page.contains(&focal));
     for curve in ["L_num", "L_proj", "L_DAQ"] {

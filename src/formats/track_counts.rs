@@ -1,0 +1,75 @@
+//! How many tracks have which verdict.
+
+use super::LabelledInput;
+use crate::domain::{Method, Solution, Status};
+use crate::solver::VERIFIED;
+
+/// How many tracks have which verdict; each track has one of the four.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct TrackCounts {
+    pub inlier: usize,
+    /// Consistent with the two registered views of a part that see them.
+    pub two_view: usize,
+    /// Seen by too few registered views for a verdict. `None`: the input is not at hand, or there is no reconstruction.
+    pub unclassified: Option<usize>,
+    /// All others. `None` where `unclassified` is.
+    pub rejected: Option<usize>,
+}
+
+impl TrackCounts {
+    pub fn new(solution: &Solution, input: Option<&LabelledInput>) -> Self {
+        let inlier = solution.inlier_track_count();
+        let two_view = solution.two_view_tracks.len();
+        let unclassified = unclassified(solution, input);
+        let judged = solution.tracks.inlier.len() - inlier;
+        let rejected = unclassified.map(|unclassified| judged.saturating_sub(two_view + unclassified));
+        Self { inlier, two_view, unclassified, rejected }
+    }
+}
+
+/// Tracks without a verdict. AUTO and GEOMETRY judge by views, the other methods give every track a weight.
+fn unclassified(solution: &Solution, input: Option<&LabelledInput>) -> Option<usize> {
+    if solution.status != Status::Solved {
+        return None;
+    }
+    if !matches!(solution.method, Method::Auto | Method::Geometry) {
+        return Some(0);
+    }
+    let raw = &input?.raw;
+    let mut has_verdict = solution.tracks.inlier.clone();
+    for track in &solution.two_view_tracks {
+        has_verdict[track.track as usize] = true;
+    }
+    let mut seen = vec![0usize; has_verdict.len()];
+    for (&view, &track) in raw.view.iter().zip(&raw.track) {
+        seen[track as usize] += usize::from(solution.views[view as usize].projection.is_some());
+    }
+    Some(has_verdict.iter().zip(seen).filter(|&(&judged, seen)| !judged && seen < VERIFIED).count())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::domain::result::TwoViewTrack;
+    use crate::formats::fixture;
+
+    #[test]
+    fn every_track_has_one_verdict() {
+        let (input, mut solution) = fixture::solved();
+        let counts = |solution: &Solution| TrackCounts::new(solution, Some(&input));
+        let all = TrackCounts { inlier: 20, two_view: 0, unclassified: Some(0), rejected: Some(20) };
+        assert_eq!(counts(&solution), all);
+        assert_eq!(TrackCounts::new(&solution, None), TrackCounts { unclassified: None, rejected: None, ..all });
+        let outlier = solution.tracks.inlier.iter().position(|inlier| !inlier).expect("an outlier") as u32;
+        solution.two_view_tracks = vec![TwoViewTrack { track: outlier, weight: 0.75, part: 0, point: None }];
+        assert_eq!(counts(&solution), TrackCounts { two_view: 1, rejected: Some(19), ..all });
+        solution.views[..3].iter_mut().for_each(|view| view.projection = None);
+        let few_views = TrackCounts { two_view: 1, unclassified: Some(19), rejected: Some(0), ..all };
+        assert_eq!(counts(&solution), few_views);
+        // The networks weigh every track, whoever sees it.
+        solution.method = Method::Paper;
+        assert_eq!(counts(&solution), TrackCounts { two_view: 1, rejected: Some(19), ..all });
+        solution.status = Status::NoReconstruction;
+        assert_eq!(counts(&solution).rejected, None);
+    }
+}
