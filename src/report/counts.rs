@@ -72,6 +72,21 @@ pub fn parts(solution: &Solution) -> BTreeMap<u32, Vec<usize>> {
     parts
 }
 
+/// The points of all parts, each with its part and its weight: those of the tracks, then the further ones of tracks that
+/// join several.
+pub fn points(solution: &Solution) -> impl Iterator<Item = (u32, f32, [f64; 3])> {
+    let tracks = &solution.tracks;
+    let own = tracks
+        .point
+        .iter()
+        .enumerate()
+        .map(|(track, point)| (track, tracks.weight.get(track).copied().unwrap_or(0.0), *point));
+    let further = solution.splits.iter().map(|split| (split.track as usize, split.weight, split.point));
+    own.chain(further)
+        .filter_map(|(track, weight, point)| Some((tracks.part_of(track)?, weight, point?)))
+        .filter(|(_, _, point)| point.iter().all(|value| value.is_finite()))
+}
+
 /// The views of each track's inlier observations, ascending, each once.
 pub fn inlier_views(solution: &Solution, input: &LabelledInput) -> Vec<Vec<u32>> {
     let mut views: Vec<Vec<u32>> = vec![Vec::new(); solution.tracks.inlier.len()];
@@ -111,6 +126,16 @@ mod tests {
         let worst: Vec<f64> = count.worst.iter().map(|worst| worst.0).collect();
         assert_eq!(worst, (1..=WORST).map(|k| n - k as f64).collect::<Vec<_>>());
         assert_eq!(count.worst[0].1, input.raw.track[inliers[inliers.len() - 1]] as usize);
+    }
+
+    #[test]
+    fn a_track_that_joins_two_points_has_both() {
+        let (input, solution) = fixture::solved_with_a_split();
+        assert_eq!(points(&solution).count(), solution.inlier_track_count() + 1);
+        let page = crate::report::page(&solution, Some(&input));
+        assert!(
+            page.contains("20 of 20 points are drawn. 1 of the 20 are further points of tracks that join several.")
+        );
     }
 
     #[test]

@@ -70,20 +70,11 @@ pub fn parts(solution: &Solution, input: Option<&LabelledInput>) -> Vec<Part> {
     parts
 }
 
-/// Every `k`-th point, of all parts together; the points that tracks join to their own are points too.
+/// Every `k`-th point, of all parts together.
 fn add_points(parts: &mut [Part], solution: &Solution) {
-    let place = |track: usize| {
-        let part = solution.tracks.part_of(track)?;
-        parts.binary_search_by_key(&part, |entry| entry.part).ok()
-    };
-    let tracks = &solution.tracks;
-    let own = tracks.point.iter().enumerate().filter_map(|(track, point)| {
-        Some((tracks.weight.get(track).copied().unwrap_or(0.0), place(track)?, (*point)?))
-    });
-    let others =
-        solution.splits.iter().filter_map(|split| Some((split.weight, place(split.track as usize)?, split.point?)));
+    let place = |part: u32| parts.binary_search_by_key(&part, |entry| entry.part).ok();
     let placed: Vec<(f32, usize, [f64; 3])> =
-        own.chain(others).filter(|(_, _, point)| point.iter().all(|value| value.is_finite())).collect();
+        counts::points(solution).filter_map(|(part, weight, point)| Some((weight, place(part)?, point))).collect();
     let step = placed.len().div_ceil(MAX_POINTS).max(1);
     for (index, (weight, part, point)) in placed.into_iter().enumerate() {
         parts[part].all_points += 1;
@@ -160,13 +151,17 @@ pub fn section(solution: &Solution, input: Option<&LabelledInput>) -> String {
     let cameras: usize = parts.iter().map(|part| part.cameras.len()).sum();
     let shown: usize = parts.iter().map(|part| part.points.len()).sum();
     let all: usize = parts.iter().map(|part| part.all_points).sum();
+    let further = match solution.splits.iter().filter(|split| split.point.is_some()).count() {
+        0 => String::new(),
+        count => format!(" {count} of the {all} are further points of tracks that join several."),
+    };
     let _ = write!(
         html,
         "<canvas id=\"solid\" tabindex=\"0\" role=\"img\" aria-label=\"{cameras} cameras and {all} points in space; arrows turn, \
          shift and arrows move, plus and minus zoom, 0 goes back\"></canvas>\n\
          <p class=\"note\">Drag or arrows to turn, wheel, pinch or + and - to zoom, shift-drag, two fingers or shift and arrows to \
          move, double click or 0 to go back. Points are coloured by weight, from orange (0) to blue (1); cameras by part. \
-         {shown} of {all} points are drawn.</p>\n"
+         {shown} of {all} points are drawn.{further}</p>\n"
     );
     html.push_str("<div class=\"grid\" id=\"plans\">\n");
     for part in parts.iter().take(MAX_PLANS) {

@@ -1,5 +1,6 @@
 //! The views: each one's figures, those left out with the reason, and the parts that they form.
 
+use std::collections::BTreeMap;
 use std::fmt::Write;
 
 use super::counts::{self, ViewCount};
@@ -37,17 +38,15 @@ pub fn parts(solution: &Solution, input: Option<&LabelledInput>, counts: &[ViewC
 }
 
 fn part_table(solution: &Solution, input: Option<&LabelledInput>) -> String {
-    let mut tracks = std::collections::BTreeMap::<u32, usize>::new();
-    for part in (0..solution.tracks.point.len()).filter_map(|track| solution.tracks.part_of(track)) {
-        *tracks.entry(part).or_default() += 1;
-    }
+    let mut points = BTreeMap::<u32, usize>::new();
+    counts::points(solution).for_each(|(part, _, _)| *points.entry(part).or_default() += 1);
     let mut html = String::from(
         "<div class=\"table\"><table>\n<tr><th>part</th><th>views</th><th>from</th><th>to</th><th>points</th></tr>\n",
     );
     for (part, views) in counts::parts(solution).iter().take(MAX_PARTS) {
         let end =
             |view: Option<&usize>| view.map_or_else(String::new, |&view| escape(&labels::view(solution, input, view)));
-        let placed = tracks.get(part).copied().unwrap_or(0);
+        let placed = points.get(part).copied().unwrap_or(0);
         let _ = writeln!(
             html,
             "<tr><td>{}</td><td>{}</td><td>{}</td><td>{}</td><td>{placed}</td></tr>",
