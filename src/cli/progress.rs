@@ -220,7 +220,7 @@ fn is_line_due(last: &Progress, now: &Progress) -> bool {
 /// What a progress record says, in a line.
 fn describe(progress: &Progress) -> String {
     let mut text = whereabouts(progress);
-    text.push_str(&format!("{} inliers", progress.inliers));
+    text.push_str(&format!("{} inliers so far", progress.inliers));
     if let Some(focal_px) = progress.focal_px {
         text.push_str(&format!(", focal {focal_px:.1} px"));
     }
@@ -325,13 +325,14 @@ mod tests {
             elapsed_seconds: 1.25,
             reconstruction: ReconstructionProgress::default(),
         };
-        assert_eq!(describe(&progress), "19 inliers, 1.2 s");
+        assert_eq!(describe(&progress), "19 inliers so far, 1.2 s");
         progress.focal_px = Some(1204.26);
         progress.best_cost = Some(0.25);
         progress.losses = Some(Losses { num: 1e-4, proj: 0.5, daq: 2.0 });
         assert_eq!(
             describe(&progress),
-            "19 inliers, focal 1204.3 px, cost 0.2500, iteration 120, L_num 1.00e-4 L_proj 0.500 L_DAQ 2.000, 1.2 s"
+            "19 inliers so far, focal 1204.3 px, cost 0.2500, iteration 120, L_num 1.00e-4 L_proj 0.500 \
+             L_DAQ 2.000, 1.2 s"
         );
     }
 
@@ -339,7 +340,7 @@ mod tests {
     fn a_line_says_where_a_solve_is() {
         let said = |stage: Stage, reconstruction: ReconstructionProgress| {
             let line = describe(&Progress { reconstruction, ..at(stage, 0.5, 1.25) });
-            line.strip_suffix("0 inliers, 1.2 s").expect("the rest as ever").to_owned()
+            line.strip_suffix("0 inliers so far, 1.2 s").expect("the rest as ever").to_owned()
         };
         let walk = ReconstructionProgress {
             block: 2,

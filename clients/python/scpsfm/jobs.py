@@ -142,7 +142,7 @@ class Progress:
     """Iterations of the paper's network done so far."""
 
     inlier_track_count: int
-    """Inlier tracks of the best hypothesis so far."""
+    """Inlier tracks of the best hypothesis so far. The result's verdicts come later: they may be more or fewer."""
 
     focal_px: float | None
     """Current estimate of the focal length in pixels."""

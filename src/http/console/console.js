@@ -821,7 +821,7 @@ class Live {
     this.bar.value = 0;
     this.steps = make("p", { className: "steps" }, "No progress yet.");
     this.charts = {
-      inliers: new Chart("Inlier tracks", ""), focal: new Chart("Focal length", "px"),
+      inliers: new Chart("Inlier tracks so far", ""), focal: new Chart("Focal length", "px"),
       views: new Chart("Registered views", ""), num: new Chart("L_num", ""), proj: new Chart("L_proj", ""),
       daq: new Chart("L_DAQ", ""),
     };

@@ -166,7 +166,7 @@ pub struct Progress {
     pub losses: Option<Losses>,
     /// The head that iteration is of; none where there is no iteration.
     pub head: Option<HeadProgress>,
-    /// Inlier tracks of the best hypothesis so far.
+    /// Inlier tracks of the best hypothesis so far. The result's verdicts come later: they may be more or fewer.
     pub inliers: u32,
     /// Current estimate of the focal length in pixels: under PAPER and SCPSFM the network's while it is optimised; else
     /// none until the calibration.
