@@ -418,7 +418,7 @@ fn a_certificate_that_clients_will_refuse_is_a_warning_at_the_start() {
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn traces_go_to_a_collector_over_tls() {
+async fn traces_and_metrics_go_to_a_collector_over_tls() {
     let directory = tempfile::tempdir().expect("a temporary directory");
     let at = directory.path();
     let authority = Authority::new("ours");
@@ -444,4 +444,12 @@ async fn traces_go_to_a_collector_over_tls() {
     assert!(tokio::task::block_in_place(|| server.running.wait()).success());
     assert_eq!(attribute(only(&collector.spans(), "submit"), "job"), Some(name));
     assert!(collector.metrics().is_empty(), "metrics are exported only with otlp.metrics");
+
+    let export = [export[0], export[1], ("SCPSFM_OTLP__METRICS", "true")];
+    let mut server = Serving::start_with(&at.join("data"), &export, Stdio::null());
+    server.running.signal(Signal::TERM);
+    assert!(tokio::task::block_in_place(|| server.running.wait()).success());
+    let exports = collector.metrics();
+    let sent = samples(exports.last().expect("an export at the end"));
+    assert!(sent["process_resident_memory_bytes"] > 1e6 && sent["scpsfm_workers"] > 0.0, "{sent:?}");
 }

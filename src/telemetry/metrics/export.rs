@@ -19,25 +19,28 @@ use super::{process, tenants};
 /// Counters or gauges of one metric, by labels.
 type Series = Registry<Key, AtomicStorage>;
 
+/// The series by metric.
+type AllSeries = HashMap<&'static str, Arc<Series>>;
+
 /// Records what a meter exports.
 pub(super) struct OtlpRecorder {
-    series: HashMap<&'static str, Arc<Series>>,
+    series: AllSeries,
     histograms: HashMap<&'static str, opentelemetry::metrics::Histogram<f64>>,
 }
 
 impl OtlpRecorder {
     /// A recorder of the metrics of the catalogue, with its help texts and buckets.
     pub(super) fn new(meter: &Meter) -> Self {
-        let (mut series, mut histograms) = (HashMap::new(), HashMap::new());
+        let (mut series, mut histograms) = (AllSeries::new(), HashMap::new());
         for metric in ALL {
             match metric.kind {
                 Kind::Counter => {
-                    let callback = counter_callback(metric, series.entry(metric.name).or_insert_with(new_series));
+                    let callback = counter_callback(metric, &mut series);
                     let counter = meter.u64_observable_counter(metric.name).with_description(metric.help);
                     counter.with_callback(callback).build();
                 }
                 Kind::Gauge => {
-                    let callback = gauge_callback(metric, series.entry(metric.name).or_insert_with(new_series));
+                    let callback = gauge_callback(metric, &mut series);
                     let gauge = meter.f64_observable_gauge(metric.name).with_description(metric.help);
                     gauge.with_callback(callback).build();
                 }
@@ -51,24 +54,25 @@ impl OtlpRecorder {
     }
 }
 
-fn new_series() -> Arc<Series> {
-    Arc::new(Series::atomic())
+/// The series of a metric that is recorded.
+fn recorded(metric: &Metric, series: &mut AllSeries) -> Arc<Series> {
+    series.entry(metric.name).or_insert_with(|| Arc::new(Series::atomic())).clone()
 }
 
 /// What an export reads of an instrument.
 type Callback<T> = Box<dyn Fn(&dyn AsyncInstrument<T>) + Send + Sync>;
 
-fn counter_callback(metric: &Metric, series: &Arc<Series>) -> Callback<u64> {
+fn counter_callback(metric: &Metric, series: &mut AllSeries) -> Callback<u64> {
     if let Some(of) = process::reading(metric) {
         return Box::new(move |observer| observe_process(of, |value| observer.observe(value, &[])));
     }
-    let series = series.clone();
+    let series = recorded(metric, series);
     Box::new(move |observer| {
         series.visit_counters(|key, value| observer.observe(value.load(Ordering::Acquire), &attributes(key)));
     })
 }
 
-fn gauge_callback(metric: &Metric, series: &Arc<Series>) -> Callback<f64> {
+fn gauge_callback(metric: &Metric, series: &mut AllSeries) -> Callback<f64> {
     if metric.name == TENANT_JOBS.name {
         return Box::new(|observer| {
             tenants::for_each(|labels, jobs| {
@@ -79,7 +83,7 @@ fn gauge_callback(metric: &Metric, series: &Arc<Series>) -> Callback<f64> {
     if let Some(of) = process::reading(metric) {
         return Box::new(move |observer| observe_process(of, |value| observer.observe(value as f64, &[])));
     }
-    let series = series.clone();
+    let series = recorded(metric, series);
     Box::new(move |observer| {
         series.visit_gauges(|key, value| {
             observer.observe(f64::from_bits(value.load(Ordering::Acquire)), &attributes(key));
@@ -108,7 +112,7 @@ impl Recorder for OtlpRecorder {
     fn register_counter(&self, key: &Key, _: &Metadata<'_>) -> Counter {
         match self.series.get(key.name()) {
             Some(series) => series.get_or_create_counter(key, |counter| Counter::from_arc(counter.clone())),
-            // Not in the catalogue: another library's.
+            // Read where it is, as what the process takes; or not in the catalogue: another library's.
             None => Counter::noop(),
         }
     }
