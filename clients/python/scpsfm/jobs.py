@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from ._stubs import job_pb2, progress_pb2, result_pb2, settings_pb2
 from .errors import InvalidArgument, Violation
 from .result import Grade, ResultStatus, _grade, _member, _Word, optional, seconds, word
+from .tracks import _plain
 
 __all__ = [
     "Capabilities",
@@ -101,7 +102,7 @@ class Settings:
         """
         message = settings_pb2.SolveSettings()
         for field in fields(self):
-            value = getattr(self, field.name)
+            value = _plain(getattr(self, field.name))
             if value is None:
                 continue
             if field.name in ("method", "backend"):

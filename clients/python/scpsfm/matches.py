@@ -22,6 +22,7 @@ from .tracks import (
     _alike,
     _append_views,
     _invalid,
+    _plain_views,
     _view_problems,
 )
 
@@ -81,7 +82,7 @@ class Matches:
         self.keypoints = tuple(_positions(f"keypoints[{view}]", given) for view, given in enumerate(keypoints))
         if views is None:
             views = _alike(self._FIELD, len(self.keypoints), width, height, names, camera_groups, focal_prior)
-        elif (width, height, names, camera_groups, focal_prior) != (None,) * 5:
+        elif any(given is not None for given in (width, height, names, camera_groups, focal_prior)):
             raise _wrong("views", "give either views, or width, height, names, camera_groups and focal_prior")
         self.views = tuple(views)
         if len(self.views) != len(self.keypoints):
@@ -91,6 +92,7 @@ class Matches:
         problems = list(_view_problems(self.views))
         if problems:
             raise _invalid(problems, field=self._FIELD)
+        self.views = _plain_views(self.views)
         self.pairs = {}
         for pair, given in pairs.items():
             first, second = self._pair(pair)

@@ -121,6 +121,8 @@ class Tracks:
 
     def __post_init__(self) -> None:
         _check(self)
+        object.__setattr__(self, "track_count", int(self.track_count))
+        object.__setattr__(self, "views", _plain_views(self.views))
 
     def __len__(self) -> int:
         """Number of observations."""
@@ -188,9 +190,10 @@ class Tracks:
         views_of = _indices("view_index", view_index)
         tracks_of = _indices("track_index", track_index)
         if views is None:
-            count = max([int(views_of.max()) + 1 if len(views_of) else 0, len(names or ()), len(camera_groups or ())])
+            told = [len(of_view) for of_view in (names, camera_groups) if of_view is not None]
+            count = max([int(views_of.max()) + 1 if len(views_of) else 0, *told])
             views = _alike(cls._FIELD, count, width, height, names, camera_groups, focal_prior)
-        elif (width, height, names, camera_groups, focal_prior) != (None,) * 5:
+        elif any(given is not None for given in (width, height, names, camera_groups, focal_prior)):
             raise _invalid([("views", "give either views, or width, height, names, camera_groups and focal_prior")])
         return cls(
             views=tuple(views),
@@ -555,12 +558,33 @@ def _is_control(name: str) -> bool:
     return any(unicodedata.category(character) == "Cc" for character in name)
 
 
+def _plain(value: Any) -> Any:
+    """A number of numpy, an array of no dimension among them, as Python's own."""
+    return value.item() if isinstance(value, np.generic | np.ndarray) and value.ndim == 0 else value
+
+
 def _is_within(value: Any, least: float, most: float) -> bool:
+    value = _plain(value)
     return isinstance(value, Real) and bool(least <= float(value) <= most)
 
 
 def _is_whole(value: Any, least: int, most: int) -> bool:
     return _is_within(value, least, most) and bool(value == int(value))
+
+
+def _plain_views(views: Sequence[View]) -> tuple[View, ...]:
+    """Views without a problem, their numbers Python's own."""
+
+    def plain(view: View) -> View:
+        size, prior = view.size, view.focal_prior
+        return View(
+            name=view.name,
+            size=None if size is None else (int(size[0]), int(size[1])),
+            camera_group=int(view.camera_group),
+            focal_prior=None if prior is None else FocalPrior(float(prior.focal_px), float(prior.sigma_log)),
+        )
+
+    return tuple(plain(view) for view in views)
 
 
 def _view_problems(views: Sequence[View]) -> Iterator[tuple[str, str]]:
@@ -571,7 +595,8 @@ def _view_problems(views: Sequence[View]) -> Iterator[tuple[str, str]]:
             yield field, f"is {type(view).__name__}, a scpsfm.View is needed"
             continue
         if not isinstance(view.name, str):
-            yield f"{field}.name", f"is {type(view.name).__name__}, a text is needed"
+            kind = "None" if view.name is None else type(view.name).__name__
+            yield f"{field}.name", f"is {kind}, a text is needed, which is empty where there is no name"
         elif view.name:
             first = names.setdefault(view.name, index)
             if first != index:
@@ -620,8 +645,8 @@ def _check(tracks: Tracks) -> None:
         raise fail([("views", f"{len(tracks.views)} views; at least 2 are needed")])
     if count == 0:
         raise fail([("x", "there are no observations")])
-    if not 1 <= tracks.track_count <= MAX_INDEX:
-        raise fail([("track_count", f"{tracks.track_count} is not from 1 to {MAX_INDEX}")])
+    if not _is_whole(tracks.track_count, 1, MAX_INDEX):
+        raise fail([("track_count", f"{tracks.track_count!r} is not a whole number from 1 to {MAX_INDEX}")])
     bounds = {"view_index": len(tracks.views), "track_index": tracks.track_count}
     for field, bound in bounds.items():
         _refuse(fail, field, rows[field], rows[field] >= bound, f"is not below {bound}, the number of them")

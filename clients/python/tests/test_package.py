@@ -11,6 +11,7 @@ import zipfile
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
 import scpsfm
@@ -47,6 +48,8 @@ def test_settings_have_the_fields_of_the_proto() -> None:
     assert message == settings_pb2.SolveSettings(method=4, backend=1, use_daq=False, epipolar_depths=True)
     assert message.HasField("use_daq")
     assert not message.HasField("alpha")
+    numpys = scpsfm.Settings(seed=np.array(3), alpha=np.float32(0.5), use_daq=np.bool_(True))  # type: ignore[arg-type]
+    assert numpys.to_proto() == settings_pb2.SolveSettings(seed=3, alpha=0.5, use_daq=True)
 
 
 def test_everything_that_is_named_is_there() -> None:

@@ -130,7 +130,10 @@ def test_what_is_not_finite_is_refused(field: str, value: float) -> None:
         ({"view_index": ["a"] * 4}, "track_set.view_indices", "whole numbers are needed"),
         ({"track_index": [0, 1, 0, 0]}, "track_set.track_indices[3]", "track 0 is observed a second time in view 1"),
         ({"track_count": 1}, "track_set.track_indices[1]", "not below 1"),
-        ({"track_count": 0}, "track_set.track_count", "0 is not from 1"),
+        ({"track_count": "3"}, "track_set.track_count", "'3' is not a whole number"),
+        ({"views": [View()] * 2, "camera_groups": np.array([0, 1])}, "track_set.views", "either views, or"),
+        ({"width": np.array([640]), "height": 480}, "track_set.views[0].size.width_px", "is not a whole number"),
+        ({"track_count": 0}, "track_set.track_count", "0 is not a whole number from 1"),
         ({"views": [View()]}, "track_set.views", "at least 2"),
         ({"views": [View()] * 2, "width": 3}, "track_set.views", "either views, or"),
         ({"views": ["a.jpg", "b.jpg"]}, "track_set.views[0]", "a scpsfm.View is needed"),
@@ -144,6 +147,7 @@ def test_what_is_not_finite_is_refused(field: str, value: float) -> None:
         ({"camera_groups": [0, -1]}, "track_set.views[1].camera_group", "-1"),
         ({"camera_groups": [0, np.nan]}, "track_set.views[1].camera_group", "nan"),
         ({"camera_groups": [0, "1"]}, "track_set.views[1].camera_group", "'1' is not a whole number"),
+        ({"names": ["a", None]}, "track_set.views[1].name", "is None, a text is needed, which is empty"),
         ({"names": ["a", 7]}, "track_set.views[1].name", "is int, a text is needed"),
         ({"width": np.nan, "height": 480}, "track_set.views[0].size.width_px", "nan is not a whole number"),
         ({"width": 640, "height": "480"}, "track_set.views[0].size.height_px", "'480' is not a whole number"),
@@ -162,6 +166,27 @@ def test_what_is_not_finite_is_refused(field: str, value: float) -> None:
 def test_defects_are_named(change: dict[str, Any], field: str, words: str) -> None:
     given: dict[str, Any] = {"view_index": VIEW, "track_index": TRACK, "x": X, "y": Y, **change}
     refused(field, words, Tracks.from_arrays, **given)
+
+
+@pytest.mark.parametrize("number", [np.array, np.float64, np.float32])
+def test_numbers_may_be_numpys(number: Any) -> None:
+    tracks = Tracks.from_arrays(
+        VIEW,
+        TRACK,
+        X,
+        Y,
+        track_count=number(5),
+        width=number(640),
+        height=number(480),
+        camera_groups=np.array([0, 1]),
+        focal_prior=FocalPrior(number(500.0), number(0.125)),
+    )
+    assert tracks.track_count == 5
+    assert tracks.views == tuple(View("", (640, 480), group, FocalPrior(500.0, 0.125)) for group in (0, 1))
+    assert isinstance(tracks.views[0].size[0], int)  # type: ignore[index]
+    message = tracks.to_proto()
+    assert (message.track_count, message.views[1].size.width_px, message.views[1].camera_group) == (5, 640, 1)
+    assert message.views[0].focal_prior.focal_px == 500.0
 
 
 def test_too_little_is_refused() -> None:
