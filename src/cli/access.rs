@@ -17,7 +17,7 @@ const ACCESS: &str = "Access to the server";
 /// Who calls, and whom to trust.
 #[derive(Debug, Clone, Default, Args)]
 pub struct AccessArgs {
-    /// Tenant whose jobs these are [default: default]
+    /// Tenant whose jobs these are [default: that of the API key; without a key `default`]
     #[arg(long, help_heading = ACCESS, value_name = "ID", env = "SCPSFM_TENANT")]
     pub tenant: Option<String>,
 
@@ -48,13 +48,12 @@ impl AccessArgs {
         self.api_key_file.is_some() || self.tls_ca.is_some() || self.tls_cert.is_some() || self.plaintext_keys
     }
 
-    /// The tenant.
+    /// The tenant as names have it: `-` is that of the key.
     ///
     /// # Errors
-    /// For what is no tenant's id, as wrong usage.
+    /// For what is no tenant's id, and a key that cannot be read, as wrong usage.
     pub fn tenant(&self) -> Result<String, Failure> {
-        let options = Options { tenant: self.tenant.clone(), ..Options::default() };
-        Ok(options.tenant()?.to_owned())
+        Ok(self.options()?.tenant()?.to_owned())
     }
 
     /// The same for the client.

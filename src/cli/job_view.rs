@@ -19,7 +19,7 @@ use crate::domain::{Grade, InputName, Status, Warning, Webhook};
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub enum GivenName {
     Whole(JobName),
-    /// Of the tenant that calls.
+    /// Of the tenant that calls; `tenants/-/` is such a name too, which a lost server leaves.
     Id(String),
 }
 
@@ -27,9 +27,10 @@ impl GivenName {
     /// # Errors
     /// For what is neither.
     pub fn parse(text: &str) -> Result<Self, String> {
-        let given = match text.contains('/') {
+        let id = text.strip_prefix("tenants/-/jobs/").unwrap_or(text);
+        let given = match id.contains('/') {
             true => JobName::parse(text).map(Self::Whole),
-            false => JobName::is_id(text).then(|| Self::Id(text.to_owned())),
+            false => JobName::is_id(id).then(|| Self::Id(id.to_owned())),
         };
         given.ok_or_else(|| format!("{text:?} is not a job's name, such as tenants/default/jobs/a1b2"))
     }
@@ -329,6 +330,7 @@ mod tests {
         assert_eq!(of("a-1", None).as_deref(), Ok("tenants/default/jobs/a-1"));
         assert_eq!(of("a-1", Some("north")).as_deref(), Ok("tenants/north/jobs/a-1"));
         assert_eq!(of("tenants/south/jobs/a-1", Some("north")).as_deref(), Ok("tenants/south/jobs/a-1"));
+        assert_eq!(of("tenants/-/jobs/a-1", None).as_deref(), Ok("tenants/default/jobs/a-1"));
         assert!(of("A", None).is_err());
         assert!(of("jobs/a", None).is_err());
     }

@@ -9,7 +9,6 @@ use tonic_types::StatusExt;
 
 use super::handshake;
 use super::options::Setting;
-use crate::domain::job::DEFAULT_TENANT;
 use crate::domain::{InvalidInput, Violation};
 
 /// Why a call came to nothing: a sentence for people, the rest for programs.
@@ -101,19 +100,6 @@ impl Error {
             self.may_be_stored = true;
         }
         self
-    }
-
-    /// Says how to name a tenant, where the server knows no such one, or nothing of this name of the default one's, and
-    /// the caller named none.
-    pub(super) fn or_no_tenant(mut self) -> Self {
-        let of_default = self.message.contains(&format!("tenants/{DEFAULT_TENANT}/"));
-        let hint = match self.reason.as_deref() {
-            Some("TENANT_NOT_FOUND") => "; `tenant` says whose jobs these are",
-            Some("JOB_NOT_FOUND" | "INPUT_NOT_FOUND") if of_default => "; `tenant` names another tenant",
-            _ => return self,
-        };
-        self.message.push_str(hint);
-        self.about(Setting::Tenant)
     }
 }
 
@@ -277,7 +263,6 @@ mod tests {
     use tonic_types::ErrorDetails;
 
     use super::*;
-    use crate::domain::job::JobName;
     use crate::rpc::status;
     use crate::telemetry::metrics::RateBound;
 
@@ -348,16 +333,6 @@ mod tests {
             let error = Error::from_status("http://a", &broke(), answered).to_string();
             assert!(error.contains("broken pipe"), "{error}");
             assert_eq!(error.contains("https://"), asked, "{error}");
-        }
-    }
-
-    #[test]
-    fn how_to_name_a_tenant_is_said_where_there_is_none() {
-        let error = |status: Status| Error::from_status("http://a", &status, true).or_no_tenant();
-        assert!(error(status::tenant_not_found("default")).message.ends_with("; `tenant` says whose jobs these are"));
-        for (name, setting) in [("tenants/default/jobs/a", Some(Setting::Tenant)), ("tenants/acme/jobs/a", None)] {
-            let error = error(status::job_not_found(&JobName::parse(name).expect("a name")));
-            assert_eq!((error.setting, error.message.contains("`tenant`")), (setting, setting.is_some()), "{name}");
         }
     }
 }

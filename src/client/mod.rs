@@ -98,10 +98,8 @@ pub struct Client {
     server: String,
     /// Whether a call was ever answered.
     answered: Arc<AtomicBool>,
-    /// Whose jobs are created and listed.
+    /// Whose jobs are created and listed, as names have it.
     tenant: String,
-    /// Whether the caller said so; it is the default one otherwise.
-    is_tenant_given: bool,
     on_wait: Option<OnWait>,
 }
 
@@ -156,7 +154,6 @@ impl Client {
             server: server.to_owned(),
             answered,
             tenant,
-            is_tenant_given: options.tenant.is_some(),
             on_wait: None,
         })
     }
@@ -177,8 +174,7 @@ impl Client {
     }
 
     fn error(&self, status: Status) -> Error {
-        let error = Error::from_status(&self.server, &status, self.answered.load(Ordering::Relaxed));
-        if self.is_tenant_given { error } else { error.or_no_tenant() }
+        Error::from_status(&self.server, &status, self.answered.load(Ordering::Relaxed))
     }
 
     /// Makes a call, and makes it again where a rate of calls or jobs refused it. For any other trouble it does not wait.

@@ -13,10 +13,13 @@ use super::error::{self, Error, ErrorKind};
 use crate::domain::job::{DEFAULT_TENANT, JobName};
 use crate::rpc::{keys, tls};
 
+/// What stands in names for the tenant of the key, which the server knows.
+const OWN_TENANT: &str = "-";
+
 /// Who calls, and whom to trust. The default sends no key and trusts the authorities of the system.
 #[derive(Debug, Clone, Default)]
 pub struct Options {
-    /// Tenant whose jobs are created and listed; `None`: `default`.
+    /// Tenant whose jobs are created and listed; `None`: that of the key, without a key `default`.
     pub tenant: Option<String>,
     /// What every call carries, where the server asks for keys.
     pub api_key: Option<ApiKey>,
@@ -76,15 +79,16 @@ impl Setting {
 }
 
 impl Options {
-    /// The tenant.
+    /// The tenant as names have it: `-` is that of the key.
     ///
     /// # Errors
     /// [`ErrorKind::Usage`] for what is no tenant's id.
     pub fn tenant(&self) -> Result<&str, Error> {
-        let tenant = self.tenant.as_deref().unwrap_or(DEFAULT_TENANT);
-        match JobName::is_id(tenant) {
-            true => Ok(tenant),
-            false => Err(Setting::Tenant.error(format_args!("{tenant:?} is not 1 to 63 of a-z, 0-9 and -"))),
+        match self.tenant.as_deref() {
+            None if self.api_key.is_some() => Ok(OWN_TENANT),
+            None => Ok(DEFAULT_TENANT),
+            Some(tenant) if JobName::is_id(tenant) => Ok(tenant),
+            Some(tenant) => Err(Setting::Tenant.error(format_args!("{tenant:?} is not 1 to 63 of a-z, 0-9 and -"))),
         }
     }
 
@@ -214,6 +218,19 @@ mod tests {
         }
         options.plaintext_keys = true;
         assert!(allowed(&options, "http://far.example:1").is_ok());
+    }
+
+    #[test]
+    fn the_key_names_the_tenant_unless_one_is_given() {
+        let api_key = Some(ApiKey::new(KEY).expect("a key"));
+        let tenant = |tenant: Option<&str>, api_key: &Option<ApiKey>| {
+            let options = Options { tenant: tenant.map(Into::into), api_key: api_key.clone(), ..Options::default() };
+            options.tenant().map(str::to_owned)
+        };
+        assert_eq!(tenant(None, &None).as_deref(), Ok("default"));
+        assert_eq!(tenant(None, &api_key).as_deref(), Ok("-"));
+        assert_eq!(tenant(Some("north"), &api_key).as_deref(), Ok("north"));
+        assert_eq!(tenant(Some("-"), &api_key).expect_err("no id").setting, Some(Setting::Tenant));
     }
 
     #[test]

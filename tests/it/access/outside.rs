@@ -149,7 +149,7 @@ async fn commands_are_let_in_and_no_secret_is_told() {
     let with = |command: &[&'static str]| command.iter().copied().chain(to_server).collect::<Vec<_>>();
     let table = "view,track,x,y\n0,0,1,1\n0,1,5,2\n1,0,2,1\n1,1,6,2\n";
     let input = written(at, "observations.csv", table);
-    let mut submit = with(&["submit", "--tenant", "north", "--method", "geometry", "--job-id", "a"]);
+    let mut submit = with(&["submit", "--method", "geometry", "--job-id", "a"]);
     submit.push(text(&input));
     let key_file = written(at, "key", &format!("{NORTH}\n"));
     submit.extend(["--api-key-file", text(&key_file)]);
@@ -160,8 +160,12 @@ async fn commands_are_let_in_and_no_secret_is_told() {
     let south = [("SCPSFM_API_KEY", SOUTH), ("SCPSFM_TENANT", "south")];
     expect(run_with(with(&["get", "a"]), &south), 65, "there is no job tenants/south/jobs/a");
     expect(run_with(with(&["get", "tenants/north/jobs/a"]), &south), 65, "there is no job");
-    let hint = "no tenant tenants/default, or the caller's key is not of it; --tenant or SCPSFM_TENANT says";
-    expect(run_with(with(&["list"]), &[("SCPSFM_API_KEY", SOUTH)]), 65, hint);
+    // The key names the tenant, unless another one is given.
+    expect(run_with(with(&["get", "a"]), &[("SCPSFM_API_KEY", NORTH)]), 0, "tenants/north/jobs/a");
+    expect(run_with(with(&["get", "tenants/-/jobs/a"]), &[("SCPSFM_API_KEY", NORTH)]), 0, "tenants/north/jobs/a");
+    expect(run_with(with(&["get", "a"]), &[("SCPSFM_API_KEY", SOUTH)]), 65, "there is no job tenants/south/jobs/a");
+    let other = [("SCPSFM_API_KEY", SOUTH), ("SCPSFM_TENANT", "north")];
+    expect(run_with(with(&["list"]), &other), 65, "no tenant tenants/north, or the caller's key is not of it");
     expect(run_with(with(&["list"]), &[]), 77, "--api-key-file");
     expect(run_with(with(&["list"]), &[("SCPSFM_API_KEY", UNKNOWN)]), 77, "not known");
     expect(run_with(with(&["list"]), &[("SCPSFM_API_KEY", &UNKNOWN[..20])]), 2, "fewer than 32");
