@@ -166,7 +166,7 @@ pub struct ReadingArgs {
 const FOCAL_SIGMA_LOG: f64 = formats::colmap::cameras::PRIOR_SIGMA_LOG;
 
 /// A number above 0.
-fn parse_positive(text: &str) -> Result<f64, String> {
+pub fn parse_positive(text: &str) -> Result<f64, String> {
     let number = text.parse::<f64>().map_err(|_| "is not a number".to_owned())?;
     if number.is_finite() && number > 0.0 { Ok(number) } else { Err("is not positive and finite".into()) }
 }

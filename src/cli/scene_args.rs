@@ -2,9 +2,10 @@
 
 use clap::{Args, ValueEnum};
 
-use super::args::parse_whole;
+use super::args::{parse_positive, parse_whole};
 use super::exit::Failure;
 use crate::domain::error::quoted;
+use crate::synthetic::scene::FOCAL_RANGE_PX;
 use crate::synthetic::{Motion, NoiseKind, OutlierKind, Scene, SceneOptions, Shape};
 
 /// The measures of the paper's scenes; `demo` has them too.
@@ -144,15 +145,25 @@ pub struct CameraArgs {
     #[arg(long, value_name = "K1", default_value_t = 0.0, allow_hyphen_values = true)]
     pub radial_k1: f64,
 
+    /// Focal length in pixels [default: random, 800 to 1600]
+    #[arg(long, value_name = "PX", value_parser = parse_positive)]
+    pub focal_px: Option<f64>,
+
     /// The focal length of each view is random in f (1 +- SHARE)
     #[arg(long, value_name = "SHARE", default_value_t = 0.0)]
     pub zoom: f64,
 }
 
 impl CameraArgs {
+    /// The range of the focal length.
+    pub fn focal_range_px(&self) -> (f64, f64) {
+        self.focal_px.map_or(FOCAL_RANGE_PX, |focal_px| (focal_px, focal_px))
+    }
+
     /// These options with this noise and this camera.
     pub fn apply(&self, options: SceneOptions) -> SceneOptions {
         SceneOptions {
+            focal_range_px: self.focal_range_px(),
             noise_kind: self.noise_kind.into(),
             principal_point: self.principal_point,
             radial_k1: self.radial_k1,

@@ -70,8 +70,8 @@ pub struct Args {
     /// each view
     #[arg(long, help_heading = "A photographed scene", conflicts_with_all = ["views", "tracks", "noise", "outliers",
         "rotation", "shape", "motion", "roll", "outlier_kind", "wrong_views", "seen_views", "wrong_observations",
-        "deleted_observations", "second_motion", "noise_kind", "principal_point", "radial_k1", "zoom", "depths",
-        "sequence"])]
+        "deleted_observations", "second_motion", "noise_kind", "principal_point", "radial_k1", "focal_px", "zoom",
+        "depths", "sequence"])]
     pub photographed: bool,
 }
 
@@ -80,7 +80,7 @@ pub struct Args {
 #[command(next_help_heading = "A sequence")]
 pub struct SequenceArgs {
     /// A camera that travels, whose tracks live a few views each; of the scene's options, --views, --tracks, --noise,
-    /// --outliers, --radial-k1, --zoom and --seed apply
+    /// --outliers, --radial-k1, --focal-px, --zoom and --seed apply
     #[arg(long, conflicts_with_all = ["depths", "shape", "motion", "outlier_kind", "wrong_views", "seen_views", "wrong_observations",
         "deleted_observations", "second_motion", "noise_kind", "principal_point", "rotation", "roll"])]
     pub sequence: bool,
@@ -129,6 +129,7 @@ impl Args {
             wrong_share: self.sequence.wrong_share,
             joined: self.sequence.joined,
             radial_k1: self.camera.radial_k1,
+            focal_range_px: self.camera.focal_range_px(),
             zoom: self.camera.zoom,
             ramp: self.sequence.ramp,
             straight: self.sequence.straight,
@@ -331,7 +332,7 @@ mod tests {
     #[test]
     fn every_argument_reaches_its_option() {
         let base = args(Path::new("out"), &[]).generate().expect("valid options").options;
-        let cases: [(&[&str], SceneOptions); 15] = [
+        let cases: [(&[&str], SceneOptions); 16] = [
             (&["--shape", "plane"], SceneOptions { shape: Shape::Plane, ..base.clone() }),
             (&["--motion", "pure-rotation"], SceneOptions { motion: Motion::PureRotation, ..base.clone() }),
             (&["--motion", "sphere"], SceneOptions { motion: Motion::Sphere, ..base.clone() }),
@@ -346,12 +347,26 @@ mod tests {
             (&["--noise-kind", "heavy"], SceneOptions { noise_kind: NoiseKind::Heavy, ..base.clone() }),
             (&["--principal-point", "-0.05,0.1"], SceneOptions { principal_point: [-0.05, 0.1], ..base.clone() }),
             (&["--radial-k1", "-0.05"], SceneOptions { radial_k1: -0.05, ..base.clone() }),
+            (&["--focal-px", "640"], SceneOptions { focal_range_px: (640.0, 640.0), ..base.clone() }),
             (&["--zoom", "0.2"], SceneOptions { zoom: 0.2, ..base.clone() }),
         ];
         for (more, expected) in cases {
             let options = args(Path::new("out"), more).generate().expect("valid options").options;
             assert_eq!(options, expected, "{more:?}");
         }
+    }
+
+    #[test]
+    fn a_focal_length_that_is_given_changes_nothing_else() {
+        let truth = |more: &[&str]| args(Path::new("out"), more).generate().expect("valid options").truth;
+        let (drawn, given) = (truth(&[]), truth(&["--focal-px", "640"]));
+        assert_eq!((given.focal_px, &given.focals_px), (640.0, &vec![640.0; 4]));
+        assert_eq!(
+            (given.points, given.rotations, given.translations, given.inlier),
+            (drawn.points, drawn.rotations, drawn.translations, drawn.inlier)
+        );
+        let sequence = args(Path::new("out"), &["--sequence", "--focal-px", "640"]).generate_sequence();
+        assert_eq!(sequence.expect("valid options").truth.focal_px, 640.0);
     }
 
     #[test]
@@ -379,7 +394,7 @@ mod tests {
         assert_eq!(truth["options"], serde_json::to_value(&options).expect("plain data"));
         assert_eq!((truth["image_width_px"].as_u64(), truth["image_height_px"].as_u64()), (Some(1600), Some(1200)));
         assert_eq!(truth["camera_groups"].as_array().map(Vec::len), Some(options.views));
-        for other in [&["--views", "5"][..], &["--sequence"], &["--radial-k1", "0.1"]] {
+        for other in [&["--views", "5"][..], &["--sequence"], &["--radial-k1", "0.1"], &["--focal-px", "640"]] {
             let arguments = [base.clone(), other.iter().map(OsStr::new).collect()].concat();
             let error = Command::try_parse_from(arguments).expect_err("the seed draws it");
             assert!(error.to_string().contains("--photographed"), "{error}");

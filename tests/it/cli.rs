@@ -114,7 +114,7 @@ fn wrong_usage_ends_with_2_and_does_nothing() {
     let directory = directory();
     let input = scene(directory.path());
     let (input, out) = (text(&input), directory.path().join("out"));
-    let cases: [&[&str]; 20] = [
+    let cases: [&[&str]; 21] = [
         &["solve", input],
         &["solve", input, "--out", text(&out), "--seed", "-1"],
         &["submit", "--server", NOBODY],
@@ -131,6 +131,7 @@ fn wrong_usage_ends_with_2_and_does_nothing() {
         &["solve", input, "--out", text(&out), "--method", "magic"],
         &["solve", input, "--out", text(&out), "--epipolar-depths"],
         &["synth", "--views", "1", "--out", text(&out)],
+        &["synth", "--focal-px", "0", "--out", text(&out)],
         &["evaluate", "--sweeps", "magic", "--out", text(&out)],
         &["evaluate", "--seeds", "0", "--out", text(&out)],
         &["evaluate", "--ablation", "--methods", "auto", "--out", text(&out)],

@@ -7,7 +7,7 @@ use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 use serde::{Deserialize, Serialize};
 
-use super::scene::{FOCAL_RANGE_PX, IMAGE_SIDE_PX, SceneOptions, normal, rows};
+use super::scene::{FOCAL_RANGE_PX, IMAGE_SIDE_PX, SceneOptions, check_focal_range, draw_focal_px, normal, rows};
 use crate::domain::error::{InvalidInput, Violation, Violations};
 use crate::domain::{ImageSize, RawInput, View};
 
@@ -50,6 +50,8 @@ options! {
         joined: f64 = 0.0,
         /// Radial distortion, as in [`SceneOptions::radial_k1`].
         radial_k1: f64 = 0.0,
+        /// Range of the focal length in pixels; of equal ends it is known.
+        focal_range_px: (f64, f64) = FOCAL_RANGE_PX,
         /// The focal length of each view is uniform in `f (1 +- zoom)`; 0: one focal length for all.
         #[serde(default)]
         zoom: f64 = 0.0,
@@ -112,6 +114,7 @@ impl SequenceOptions {
         if self.straight > self.views {
             found.push(Violation::of("straight", format!("{} is not in 0..={}, the views", self.straight, self.views)));
         }
+        check_focal_range(self.focal_range_px, &mut found);
         let limit = SceneOptions::MAX_RADIAL_K1;
         if !(-limit..=limit).contains(&self.radial_k1) {
             found.push(Violation::of("radial_k1", format!("{} is not in -{limit}..={limit}", self.radial_k1)));
@@ -178,7 +181,7 @@ impl Sequence {
     pub fn generate(options: &SequenceOptions) -> Result<Self, InvalidInput> {
         options.validate()?;
         let mut rng = ChaCha8Rng::seed_from_u64(options.seed);
-        let focal_px = rng.random_range(FOCAL_RANGE_PX.0..FOCAL_RANGE_PX.1);
+        let focal_px = draw_focal_px(options.focal_range_px, &mut rng);
         let focal = focal_px / f64::from(IMAGE_SIDE_PX);
         let mut cameras: Vec<Camera> =
             (0..options.views).map(|view| camera(view, rng.random_range(-0.05..0.05), focal)).collect();

@@ -29,6 +29,7 @@ pub use self::noise::NoiseKind;
 use self::noise::Observation;
 pub(super) use self::noise::normal;
 pub use self::options::SceneOptions;
+pub(super) use self::options::check_focal_range;
 pub use self::shape::Shape;
 use self::stream::Stream;
 use crate::domain::error::InvalidInput;
@@ -102,7 +103,7 @@ impl Scene {
     pub fn generate(options: &SceneOptions) -> Result<Self, InvalidInput> {
         options.validate()?;
         let mut rng = Stream::Paper.of(options.seed);
-        let focal_px = rng.random_range(options.focal_range_px.0..options.focal_range_px.1);
+        let focal_px = draw_focal_px(options.focal_range_px, &mut rng);
         let points = shape::draw_points(options, &mut rng);
         let cameras = draw_cameras(options, focal_px, &points, &mut rng)?;
         let visible = visibility::draw_visibility(options, &cameras);
@@ -148,6 +149,15 @@ impl Scene {
     }
 }
 
+/// A focal length of a range. One that is known takes a random number as well, so that all else stays as it is.
+pub(super) fn draw_focal_px((least, most): (f64, f64), rng: &mut ChaCha8Rng) -> f64 {
+    if least < most {
+        return rng.random_range(least..most);
+    }
+    let _: f64 = rng.random();
+    least
+}
+
 fn principal_point_px(options: &SceneOptions) -> [f64; 2] {
     let side_px = f64::from(IMAGE_SIDE_PX);
     options.principal_point.map(|displacement| (side_px - 1.0) / 2.0 + displacement * side_px)
@@ -168,7 +178,7 @@ fn draw_cameras(
     let mut zoom_rng = Stream::Zoom.of(options.seed);
     let mut own_rng = Stream::OwnCameras.of(options.seed);
     let mut own = |pose| {
-        let focal_px = own_rng.random_range(options.focal_range_px.0..options.focal_range_px.1);
+        let focal_px = draw_focal_px(options.focal_range_px, &mut own_rng);
         let mut shift = || own_rng.random_range(-1.0..1.0);
         let [x, y, bend] = [shift(), shift(), shift()];
         let shift_px = OWN_PRINCIPAL_POINT * f64::from(IMAGE_SIDE_PX);

@@ -48,7 +48,7 @@ options! {
         /// Largest roll: each camera is turned about its optical axis as well, uniform in `+-max_roll_rad`, whatever
         /// the motion.
         max_roll_rad: f64 = 0.0,
-        /// Range of the focal length in pixels.
+        /// Range of the focal length in pixels; of equal ends it is known.
         focal_range_px: (f64, f64) = FOCAL_RANGE_PX,
         /// Whether every view has a camera of its own, and is a camera group: a focal length in that range, a principal
         /// point up to .02 of the width off the common one along each axis, and a distortion within 5 % of the common
@@ -188,11 +188,7 @@ impl SceneOptions {
     }
 
     fn check_camera(&self, found: &mut Violations) {
-        let (least, most) = self.focal_range_px;
-        if !(least > 0.0 && least < most && most.is_finite()) {
-            found
-                .push(Violation::of("focal_range_px", format!("{least} to {most} is not a range of positive numbers")));
-        }
+        check_focal_range(self.focal_range_px, found);
         for (axis, displacement) in self.principal_point.into_iter().enumerate() {
             let most = Self::MAX_DISPLACEMENT;
             if !(-most..=most).contains(&displacement) {
@@ -207,6 +203,14 @@ impl SceneOptions {
         if !(0.0..=Self::MAX_ZOOM).contains(&self.zoom) {
             found.push(Violation::of("zoom", format!("{} is not a share in 0..={}", self.zoom, Self::MAX_ZOOM)));
         }
+    }
+}
+
+/// Refuses what is no range of focal lengths.
+pub(in crate::synthetic) fn check_focal_range((least, most): (f64, f64), found: &mut Violations) {
+    if !(least > 0.0 && least <= most && most.is_finite()) {
+        let reason = format!("{least} to {most} is not a range of positive numbers");
+        found.push(Violation::of("focal_range_px", reason));
     }
 }
 
@@ -249,6 +253,7 @@ mod tests {
             ("radial_k1", SceneOptions { radial_k1: f64::INFINITY, ..default() }),
             ("zoom", SceneOptions { zoom: 1.0, ..default() }),
             ("focal_range_px", SceneOptions { focal_range_px: (500.0, 400.0), ..default() }),
+            ("focal_range_px", SceneOptions { focal_range_px: (0.0, 0.0), ..default() }),
         ];
         for (name, options) in cases {
             let error = options.validate().expect_err(name);
