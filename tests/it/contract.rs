@@ -9,7 +9,7 @@ use prost_reflect::{DescriptorPool, EnumDescriptor, FieldDescriptor, MessageDesc
 use scpsfm::rpc::proto;
 use serde_json::Value;
 
-use crate::http::get;
+use crate::support::http::get;
 use crate::support::program::{Serving, run};
 
 /// How far a job was when it was asked for: what is in it depends on the moment.

@@ -16,7 +16,7 @@ use tonic_health::pb::HealthCheckRequest;
 use tonic_health::pb::health_client::HealthClient;
 use tonic_types::StatusExt;
 
-use crate::http::request;
+use crate::support::http::request;
 use crate::support::keys::{Keyed, NORTH, SOUTH, keyed};
 use crate::support::program::{Serving, run};
 use crate::support::scrape::Page;

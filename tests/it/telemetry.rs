@@ -14,9 +14,9 @@ use scpsfm::rpc::proto::{self, JobState, create_job_request::Source};
 use tonic::Code;
 use tonic::transport::{Channel, Identity, ServerTlsConfig};
 
-use crate::http::request;
 use crate::support::certificates::Authority;
 use crate::support::collector::{Collector, attribute, hex, only, samples, text};
+use crate::support::http::request;
 use crate::support::keys::{NORTH, SOUTH, keyed};
 use crate::support::live::{connected, created, easy, lasting, reaches, small};
 use crate::support::program::Serving;

@@ -18,8 +18,8 @@ use serde_json::{Value, json};
 use sha2::Sha256;
 use tokio_rustls::rustls::{ServerConfig, ServerConnection, StreamOwned};
 
-use crate::http::{Answer, get, path_of, post, request, tracks};
 use crate::support::certificates::Authority;
+use crate::support::http::{Answer, get, path_of, post, request, tracks};
 use crate::support::live;
 use crate::support::program::{Running, Serving, run};
 use crate::support::python::python;

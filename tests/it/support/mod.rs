@@ -3,6 +3,7 @@
 pub mod certificates;
 pub mod collector;
 pub mod connections;
+pub mod http;
 pub mod keys;
 pub mod live;
 pub mod memory;
