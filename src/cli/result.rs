@@ -2,8 +2,10 @@
 
 use std::path::PathBuf;
 
-use super::args::{ExportArgs, ReadingArgs, ServerArgs};
+use super::args::ServerArgs;
 use super::exit::{Exit, Failure};
+use super::export_args::ExportArgs;
+use super::input_args::ReadingArgs;
 use super::job_view::GivenName;
 use super::next_steps::Files;
 use super::{print, summary};

@@ -5,10 +5,10 @@ use std::path::PathBuf;
 use clap::ValueEnum;
 use tokio_util::sync::CancellationToken;
 
-use super::args::BackendArg;
 use super::exit::{Exit, Failure};
 use super::interrupt::Signals;
 use super::service::Service;
+use super::settings_args::BackendArg;
 use super::{print, prior_file};
 use crate::config::Config;
 use crate::engine::StoreState;

@@ -3,13 +3,16 @@
 use std::path::PathBuf;
 
 use super::access::AccessArgs;
-use super::args::{ExportArgs, InputArgs, ServerArgs, SettingsArgs, tell_notes};
+use super::args::ServerArgs;
 use super::exit::{Exit, Failure};
+use super::export_args::ExportArgs;
+use super::input_args::{InputArgs, tell_notes};
 use super::interrupt::Interrupt;
 use super::job_view::{Lost, quoted};
 use super::next_steps::Files;
 use super::prior_file::PriorFileArgs;
 use super::progress::ProgressView;
+use super::settings_args::SettingsArgs;
 use super::windows::{self, Show, WindowArgs};
 use super::{job_view, print, remote, summary};
 use crate::client::ErrorKind;

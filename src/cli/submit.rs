@@ -7,8 +7,10 @@ use std::time::Duration;
 use clap::builder::NonEmptyStringValueParser;
 
 use super::access::AccessArgs;
-use super::args::{ReadingArgs, ServerArgs, SettingsArgs, tell_notes};
+use super::args::ServerArgs;
 use super::exit::{Exit, Failure};
+use super::input_args::{ReadingArgs, tell_notes};
+use super::settings_args::SettingsArgs;
 use super::{job_view, print, remote};
 use crate::client::JobOptions;
 use crate::domain::job::JobName;

@@ -1,7 +1,8 @@
 //! `scpsfm upload`: leaves an input with a server.
 
-use super::args::{InputArgs, ServerArgs, tell_notes};
+use super::args::ServerArgs;
 use super::exit::{Exit, Failure};
+use super::input_args::{InputArgs, tell_notes};
 use super::progress::TransferView;
 use super::{print, remote};
 use crate::client::EncodedInput;

@@ -1,0 +1,152 @@
+//! How to solve, as arguments.
+
+use clap::{Args, ValueEnum};
+
+use super::args::parse_whole;
+use super::exit::Failure;
+use crate::domain::{Backend, Method, SolveSettings};
+
+/// How to solve.
+#[derive(Debug, Clone, Args)]
+#[command(next_help_heading = "How to solve")]
+pub struct SettingsArgs {
+    /// What decides which tracks are right
+    #[arg(long, value_enum, default_value_t = MethodArg::Auto)]
+    pub method: MethodArg,
+
+    /// Seed of every random choice: one seed, one answer
+    #[arg(long, default_value_t = 0, value_parser = parse_whole::<u64>)]
+    pub seed: u64,
+
+    #[arg(long, value_name = "N", help = format!("Iterations of each optimisation of the network, 1 to {}; `scpsfm` \
+        does up to 16 of them, `paper` one, `auto` usually none", SolveSettings::MAX_ITERATIONS),
+        default_value_t = SolveSettings::DEFAULT_ITERATIONS,
+        value_parser = clap::value_parser!(u32).range(1..=i64::from(SolveSettings::MAX_ITERATIONS)))]
+    pub iterations: u32,
+
+    /// Leave the DAQ residual (self-calibration) out of the losses and scores
+    #[arg(long)]
+    pub no_daq: bool,
+
+    /// With `paper`, `scpsfm` and `psfm`, for an input without depths: estimate projective depths from fundamental
+    /// matrices and epipoles, instead of taking them as 1; needs about half of the tracks to be right
+    #[arg(long)]
+    pub epipolar_depths: bool,
+
+    /// Noise of the observations in pixels, one standard deviation, where known: a start, the noise is estimated
+    #[arg(long, value_name = "PX")]
+    pub noise_px: Option<f64>,
+
+    /// A focal length a view (a zoom) instead of one for all: the grade is WEAK at best then, all views share one lens,
+    /// and camera groups and priors are not looked at
+    #[arg(long)]
+    pub focal_per_view: bool,
+
+    /// Tensor backend of the network [default: flex, or what the server is configured with]
+    #[arg(long, value_enum)]
+    pub backend: Option<BackendArg>,
+
+    #[arg(long, hide_short_help = true, help = format!("Weight of the loss L_proj at the first iteration; with \
+        `paper`, at every iteration [default: {}; paper: {}]",
+        SolveSettings::DEFAULT_ALPHA, SolveSettings::PAPER_ALPHA))]
+    pub alpha: Option<f64>,
+
+    /// Weight of the loss L_DAQ
+    #[arg(long, hide_short_help = true, default_value_t = SolveSettings::DEFAULT_BETA)]
+    pub beta: f64,
+
+    /// Least number of inliers that the loss L_num asks for (the paper's t) at the first iteration; with `paper`, at
+    /// every iteration
+    #[arg(long, hide_short_help = true, value_name = "T", default_value_t = SolveSettings::DEFAULT_MIN_INLIERS)]
+    pub min_inliers: f64,
+
+    /// Slope of the sigmoid in L_num, with `paper` only; 1 is as printed and may let all weights collapse to 0
+    #[arg(long, hide_short_help = true, default_value_t = SolveSettings::DEFAULT_KAPPA)]
+    pub kappa: f64,
+
+    /// Learning rate of Adam
+    #[arg(long, hide_short_help = true, value_name = "RATE", default_value_t = SolveSettings::DEFAULT_LEARNING_RATE)]
+    pub learning_rate: f64,
+
+    /// Width of the network as a share of the original PointNet
+    #[arg(long, hide_short_help = true, value_name = "SHARE", default_value_t = SolveSettings::DEFAULT_NETWORK_WIDTH)]
+    pub network_width: f64,
+}
+
+impl SettingsArgs {
+    /// The settings, checked.
+    ///
+    /// # Errors
+    /// A value out of range, as wrong usage.
+    pub fn settings(&self) -> Result<SolveSettings, Failure> {
+        let method = self.method.into();
+        let settings = SolveSettings {
+            method,
+            use_daq: !self.no_daq,
+            alpha: self.alpha.unwrap_or(SolveSettings::default_alpha(method)),
+            beta: self.beta,
+            min_inliers: self.min_inliers,
+            kappa: self.kappa,
+            learning_rate: self.learning_rate,
+            iterations: self.iterations,
+            network_width: self.network_width,
+            epipolar_depths: self.epipolar_depths,
+            seed: self.seed,
+            noise_px: self.noise_px,
+            focal_per_view: self.focal_per_view,
+            backend: self.backend.map(Backend::from),
+            ..SolveSettings::default()
+        };
+        settings.validate().map_err(Failure::usage)?;
+        if self.epipolar_depths && !matches!(self.method, MethodArg::Paper | MethodArg::Scpsfm | MethodArg::Psfm) {
+            return Err(Failure::usage("--epipolar-depths is of use with --method paper, scpsfm and psfm only"));
+        }
+        Ok(settings)
+    }
+}
+
+/// [`Method`] on the command line.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
+pub enum MethodArg {
+    /// The network's prior and geometry together
+    Auto,
+    /// The paper's network under its objective as printed, for comparison: one optimisation, thresholded at 1/2
+    Paper,
+    /// Geometry alone, no network
+    Geometry,
+    /// Plain projective factorisation (Sturm and Triggs 1996)
+    Psfm,
+    /// The paper's network by itself under a continued objective: the best of up to 16 optimisations, thresholded at
+    /// 1/2
+    Scpsfm,
+}
+
+impl From<MethodArg> for Method {
+    fn from(method: MethodArg) -> Self {
+        match method {
+            MethodArg::Auto => Method::Auto,
+            MethodArg::Paper => Method::Paper,
+            MethodArg::Geometry => Method::Geometry,
+            MethodArg::Psfm => Method::Psfm,
+            MethodArg::Scpsfm => Method::Scpsfm,
+        }
+    }
+}
+
+/// [`Backend`] on the command line.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
+pub enum BackendArg {
+    /// burn-flex, the faster of the two
+    Flex,
+    /// burn-ndarray
+    Ndarray,
+}
+
+impl From<BackendArg> for Backend {
+    fn from(backend: BackendArg) -> Self {
+        match backend {
+            BackendArg::Flex => Backend::Flex,
+            BackendArg::Ndarray => Backend::Ndarray,
+        }
+    }
+}
