@@ -170,3 +170,7 @@ fn observations_csv(solution: &Solution, input: &LabelledInput) -> String {
 #[cfg(test)]
 #[path = "result_files_tests.rs"]
 mod tests;
+
+#[cfg(test)]
+#[path = "result_replacement_tests.rs"]
+mod replacement_tests;
