@@ -8,6 +8,7 @@ mod batch;
 mod chaos;
 mod chart;
 mod cli;
+mod cli_server;
 mod colmap;
 mod contract;
 mod crash;
