@@ -1,19 +1,27 @@
 //! What programs outside rely on: the API as it was released, and the names in the files of a result, in what commands
-//! print with `--json` and of the paths over HTTP, as far as a run shows them.
+//! print with `--json`, and over HTTP of the paths and in errors, as far as a run or an event shows them.
 
 use std::collections::BTreeSet;
 use std::fs;
 use std::path::Path;
+use std::process::Stdio;
+use std::time::SystemTime;
 
 use prost_reflect::{DescriptorPool, EnumDescriptor, FieldDescriptor, MessageDescriptor};
+use scpsfm::cli::job_view::event_json;
+use scpsfm::domain::job::{AttemptEnd, EventBody, Failure, JobEvent, JobName, JobState, PastAttempt};
+use scpsfm::domain::{HeadProgress, Losses, Phase, Progress, ReconstructionProgress, Stage, Step, Task};
 use scpsfm::rpc::proto;
-use serde_json::Value;
+use serde_json::{Value, json};
 
-use crate::support::http::get;
+use crate::support::http::{get, post};
 use crate::support::program::{Serving, run};
 
-/// How far a job was when it was asked for: what is in it depends on the moment.
+/// How far a job was when it was asked for: what is in it depends on the moment. [`rare_events`] has all of it.
 const PROGRESS: &str = "progress";
+
+/// 32 bytes.
+const WEBHOOK_SECRET: &str = "whsec_c2VjcmV0LXNlY3JldC1zZWNyZXQtc2VjcmV0LXNlYzE=";
 
 /// Names by where they are, one line each.
 #[derive(Default)]
@@ -63,6 +71,50 @@ impl Names {
     }
 }
 
+/// What a watch prints only at times: progress with all that it can hold, interim weights, and a failure with its
+/// attempts.
+fn rare_events() -> [Value; 3] {
+    let head = HeadProgress {
+        head: 1,
+        iteration: 1,
+        phase: Some(Phase::Growth),
+        weight_sum: 1.0,
+        weight_histogram: [1; HeadProgress::BINS],
+        tolerance: Some(0.5),
+        best_daq_residual: Some(0.5),
+    };
+    let step = Step { task: Task::Heads, step: 1, steps: 2 };
+    let progress = Progress {
+        stage: Stage::Search,
+        fraction: 0.5,
+        iteration: 1,
+        losses: Some(Losses { num: 1.0, proj: 1.0, daq: 1.0 }),
+        head: Some(head),
+        inliers: 1,
+        focal_px: Some(1.0),
+        best_cost: Some(0.5),
+        elapsed_seconds: 1.0,
+        reconstruction: ReconstructionProgress { step: Some(step), ..ReconstructionProgress::default() },
+    };
+    let attempt = PastAttempt {
+        attempt: 1,
+        server: "here".into(),
+        start_time: SystemTime::UNIX_EPOCH,
+        end_time: SystemTime::UNIX_EPOCH,
+        end: AttemptEnd::Lost,
+    };
+    let failure = Failure { attempts: vec![attempt], ..Failure::new("ATTEMPTS_EXHAUSTED", "no more") };
+    let bodies = [
+        EventBody::Progress(progress),
+        EventBody::Weights { iteration: 1, weights: vec![0.5] },
+        EventBody::State { state: JobState::Failed, failure: Some(failure) },
+    ];
+    bodies.map(|body| {
+        let job = JobName { tenant: "default".into(), job: "a".into() };
+        event_json(&JobEvent { job, attempt: 1, sequence: Some(1), time: SystemTime::UNIX_EPOCH, body })
+    })
+}
+
 /// Runs the program; returns what it printed. Ending without a reconstruction is as good as any.
 fn printed(arguments: &[&str]) -> String {
     let ran = run(arguments);
@@ -91,11 +143,14 @@ fn no_released_name_is_gone_and_every_new_one_is_listed() {
     let walk = ["--sequence", "--views", "8", "--tracks", "200"];
     solved(&walk, &["--window", "4"], "windows");
 
-    let server = Serving::start(&directory.path().join("data"));
+    let webhooks = [("SCPSFM_WEBHOOKS__SECRET", WEBHOOK_SECRET), ("SCPSFM_WEBHOOKS__ALLOW_PRIVATE_ADDRESSES", "true")];
+    let server = Serving::start_with(&directory.path().join("data"), &webhooks, Stdio::null());
     let at = ["--server", &server.grpc];
     // Long enough to tell of its progress.
     let long = ["--method", "paper", "--iterations", "1000"];
-    let job = printed(&[&["submit", &input], &size[..], &long, &at].concat());
+    // Nobody hears of its end.
+    let webhook = ["--webhook", "http://127.0.0.1:1/"];
+    let job = printed(&[&["submit", &input], &size[..], &long, &webhook, &at].concat());
     let job = job.trim();
     printed(&[&["upload", &input], &size[..], &at].concat());
     let commands = [&["watch", job][..], &["get", job], &["list"], &["inputs"], &["admin", "queue"]];
@@ -104,6 +159,15 @@ fn no_released_name_is_gone_and_every_new_one_is_listed() {
         let answer = printed(&[command, &["--json"], &at].concat());
         let values = serde_json::Deserializer::from_str(&answer).into_iter::<Value>();
         values.for_each(|value| names.add_keys(&place, "", &value.expect("JSON")));
+    }
+    for event in rare_events() {
+        names.add_keys("watch JOB --json", "", &event);
+        names.add_keys("watch JOB --json", "progress.", &event[PROGRESS]);
+    }
+    let (unknown, malformed) =
+        (get(&server, "/v1/tenants/-/jobs/none"), post(&server, "/v1/tenants/-/jobs", &json!({})));
+    for refusal in [unknown, malformed] {
+        names.add_keys("an error over HTTP", "", &refusal.json());
     }
     for (path, methods) in get(&server, "/openapi.json").json()["paths"].as_object().expect("paths") {
         methods.as_object().expect("methods").keys().for_each(|method| names.add(method, path));
