@@ -1,6 +1,6 @@
 //! Homographies between views, and whether they explain them: then the scene is planar or the camera only turned.
 
-use nalgebra::{Matrix3, SMatrix, Vector2};
+use nalgebra::{Matrix3, SMatrix, Vector2, Vector3};
 
 use super::fundamental::Match;
 use super::null_vector::{projection_equations, smallest_eigenvector};
@@ -50,6 +50,16 @@ fn median_to(seen: &Correspondences, reference: usize, noise: f64) -> Option<f64
     (!residuals.is_empty()).then(|| median(&mut residuals))
 }
 
+/// Views without parallax, each placed by the points that it sees.
+#[derive(Debug, Clone)]
+pub struct Placed {
+    /// What takes the points to the images of each view, up to scale.
+    pub views: Vec<Matrix3<f64>>,
+    /// In the frame of the view that was placed first, of unit length; `None` where no view sees them, and left out past
+    /// the last one that is seen.
+    pub points: Vec<Option<Vector3<f64>>>,
+}
+
 /// Image points by view, to find what two views have in common.
 #[derive(Debug, Clone)]
 pub struct Correspondences {
@@ -58,32 +68,50 @@ pub struct Correspondences {
 }
 
 impl Correspondences {
-    /// Homographies from one view to every view, each by way of the views that share most points.
+    /// Places all views, one after the other, by the points that those before it have placed; next is the one that sees
+    /// most of these.
+    ///
+    /// A view that shares few points with any one other may share enough with all of them together.
+    ///
+    /// * `first`: what takes points to the images of the view that is placed first
+    /// * `place`: the same of another view, from points and where it sees them
+    ///
+    /// Returns `None` where a view cannot be placed.
+    pub fn placed(
+        &self,
+        (reference, first): (usize, Matrix3<f64>),
+        place: impl Fn(&[(Vector3<f64>, Vector2<f64>)]) -> Option<Matrix3<f64>>,
+    ) -> Option<Placed> {
+        let count = self.by_view.iter().filter_map(|seen| seen.last()).map(|(point, _)| point + 1).max()?;
+        let mut points: Vec<Option<Vector3<f64>>> = vec![None; count];
+        let mut views = vec![None; self.by_view.len()];
+        let (mut next, mut found) = (reference, first);
+        loop {
+            *views.get_mut(next)? = Some(found);
+            let back = found.try_inverse()?;
+            for (point, xy) in &self.by_view[next] {
+                points[*point].get_or_insert_with(|| (back * xy.push(1.0)).normalize());
+            }
+            let placed =
+                |view: &usize| self.by_view[*view].iter().filter(|(point, _)| points[*point].is_some()).count();
+            let open = (0..views.len()).filter(|&view| views[view].is_none());
+            let Some(view) = open.max_by_key(|view| (placed(view), std::cmp::Reverse(*view))) else { break };
+            let seen: Vec<_> =
+                self.by_view[view].iter().filter_map(|(point, xy)| Some((points[*point]?, *xy))).collect();
+            (next, found) = (view, place(&seen)?);
+        }
+        Some(Placed { views: views.into_iter().collect::<Option<_>>()?, points })
+    }
+
+    /// Homographies from one view to every view.
     ///
     /// * `noise`: standard deviation of a coordinate
     ///
-    /// Returns `None` where views that share enough points do not tie all views together.
-    pub fn homographies_from(&self, reference: usize, noise: f64) -> Option<Vec<Matrix3<f64>>> {
-        let views = self.by_view.len();
-        let mut found: Vec<Option<Matrix3<f64>>> = vec![None; views];
-        *found.get_mut(reference)? = Some(Matrix3::identity());
-        // The view of the tree that each view outside of it shares most points with (Prim's algorithm), the reference
-        // first among equals.
-        let mut links: Vec<(Vec<Match>, usize)> = (0..views).map(|_| (Vec::new(), reference)).collect();
-        let mut joined = reference;
-        for _ in 1..views {
-            let outside = || (0..views).filter(|&view| found[view].is_none());
-            for view in outside() {
-                let shared = self.common(joined, view);
-                if shared.len() > links[view].0.len() {
-                    links[view] = (shared, joined);
-                }
-            }
-            joined = outside().max_by_key(|&view| (links[view].0.len(), std::cmp::Reverse(view)))?;
-            let (shared, from) = &links[joined];
-            found[joined] = Some(between(shared, noise)? * found[*from]?);
-        }
-        found.into_iter().collect()
+    /// Returns `None` where the points do not tie all views together.
+    pub fn homographies_from(&self, reference: usize, noise: f64) -> Option<Placed> {
+        self.placed((reference, Matrix3::identity()), |seen| {
+            robust(seen, noise.max(f64::EPSILON)).map(|(homography, _)| homography)
+        })
     }
 
     /// Sorts the observations; views out of range and what is no number are left out.
@@ -121,7 +149,8 @@ impl Correspondences {
 /// How far the best homography between two views misses, in units of the noise and corrected for its eight unknowns.
 fn pair_residual(pairs: &[Match], noise: f64) -> Option<f64> {
     let noise = noise.max(f64::EPSILON);
-    let (_, mut errors) = robust(pairs, noise)?;
+    let seen: Vec<_> = pairs.iter().map(|Match { from, to }| (from.push(1.0), *to)).collect();
+    let (_, mut errors) = robust(&seen, noise)?;
     errors.sort_by(f64::total_cmp);
     let quantile = errors[((pairs.len() as f64 * QUANTILE) as usize).min(pairs.len() - 1)];
     let freedom = 1.0 - 4.0 / pairs.len() as f64;
@@ -129,26 +158,22 @@ fn pair_residual(pairs: &[Match], noise: f64) -> Option<f64> {
     residual.is_finite().then_some(residual)
 }
 
-/// The homography from the first to the second points of these pairs, by a reweighted direct linear transform.
+/// The homography that takes points to where they are seen, by a reweighted direct linear transform, and the distance by
+/// which it misses each.
 ///
-/// Returns `None` for fewer than [`LEAST_COMMON`] pairs and for pairs that determine none.
-fn between(pairs: &[Match], noise: f64) -> Option<Matrix3<f64>> {
-    robust(pairs, noise.max(f64::EPSILON)).map(|(homography, _)| homography)
-}
-
-/// The same with the distance by which it misses each point.
-fn robust(pairs: &[Match], noise: f64) -> Option<(Matrix3<f64>, Vec<f64>)> {
-    if pairs.len() < LEAST_COMMON {
+/// Returns `None` for fewer than [`LEAST_COMMON`] points and for points that determine none.
+fn robust(seen: &[(Vector3<f64>, Vector2<f64>)], noise: f64) -> Option<(Matrix3<f64>, Vec<f64>)> {
+    if seen.len() < LEAST_COMMON {
         return None;
     }
     let mut homography = Matrix3::zeros();
-    let mut weights = vec![1.0; pairs.len()];
-    let mut errors = vec![f64::INFINITY; pairs.len()];
+    let mut weights = vec![1.0; seen.len()];
+    let mut errors = vec![f64::INFINITY; seen.len()];
     for _ in 0..ROUNDS {
-        homography = direct_linear_transform(pairs, &weights)?;
-        for ((error, weight), Match { from, to }) in errors.iter_mut().zip(&mut weights).zip(pairs) {
-            let moved = homography * from.push(1.0);
-            *error = (moved.xy() / moved.z - to).norm();
+        homography = direct_linear_transform(seen, &weights)?;
+        for ((error, weight), (point, xy)) in errors.iter_mut().zip(&mut weights).zip(seen) {
+            let moved = homography * point;
+            *error = (moved.xy() / moved.z - xy).norm();
             // The scale makes the algebraic error geometric, the rest bounds what one wrong point can do.
             let scale = moved.z * moved.z * (1.0 + (*error / (CAUCHY_SCALE * noise)).powi(2));
             *weight = if scale.is_finite() && scale > 0.0 { scale.recip() } else { 0.0 };
@@ -158,10 +183,10 @@ fn robust(pairs: &[Match], noise: f64) -> Option<(Matrix3<f64>, Vec<f64>)> {
 }
 
 /// The homography with the least weighted algebraic error, at unit norm.
-fn direct_linear_transform(pairs: &[Match], weights: &[f64]) -> Option<Matrix3<f64>> {
+fn direct_linear_transform(seen: &[(Vector3<f64>, Vector2<f64>)], weights: &[f64]) -> Option<Matrix3<f64>> {
     let mut normal = SMatrix::<f64, 9, 9>::zeros();
-    for (Match { from, to }, weight) in pairs.iter().zip(weights) {
-        for equation in projection_equations::<3, 9>(&from.push(1.0), to) {
+    for ((point, xy), weight) in seen.iter().zip(weights) {
+        for equation in projection_equations::<3, 9>(point, xy) {
             normal += equation * equation.transpose() * *weight;
         }
     }
@@ -208,7 +233,7 @@ mod tests {
         scene.observations.retain(|seen| (seen.point % 9..seen.point % 9 + 4).contains(&seen.view));
         let seen = Correspondences::new(&scene.observations, 12);
         assert!(seen.common(0, 11).is_empty());
-        for (view, found) in seen.homographies_from(0, 1e-6).expect("a chain").iter().enumerate() {
+        for (view, found) in seen.homographies_from(0, 1e-6).expect("a chain").views.iter().enumerate() {
             let found = found.normalize();
             let apart = (found - expected[view]).norm().min((found + expected[view]).norm());
             assert!(apart < 1e-6, "view {view}: {found} {}", expected[view]);
@@ -216,6 +241,24 @@ mod tests {
         scene.observations.retain(|seen| (seen.view < 6) == (seen.point % 9 < 3));
         scene.observations.retain(|seen| seen.view < 6 || seen.point % 9 > 5);
         assert!(Correspondences::new(&scene.observations, 12).homographies_from(0, 1e-6).is_none());
+    }
+
+    /// A view shares four points with each of four others, and six with none.
+    #[test]
+    fn a_view_is_placed_by_what_several_others_see() {
+        let mut scene = testing::scene_of(1, 5, 56, 0.0, Motion::Rotation, false);
+        scene.observations.retain(|seen| match seen.view {
+            4 => seen.point < 16,
+            view => seen.point >= 16 || seen.point / 4 == view,
+        });
+        let seen = Correspondences::new(&scene.observations, 5);
+        assert!((0..4).all(|view| seen.common(view, 4).len() == 4));
+        let placed = seen.homographies_from(0, 1e-6).expect("enough points together");
+        for seen in &scene.observations {
+            let moved = placed.views[seen.view] * placed.points[seen.point].expect("observed");
+            let missed = (moved.xy() / moved.z - seen.xy).norm();
+            assert!(missed < 1e-6, "view {}, point {}: {missed}", seen.view, seen.point);
+        }
     }
 
     #[test]

@@ -32,3 +32,14 @@ impl Observation {
             && self.weight.is_finite()
     }
 }
+
+/// How many of so many points have an observation.
+pub fn observed_points(observations: &[Observation], points: usize) -> usize {
+    let mut seen = vec![false; points];
+    for observation in observations {
+        if let Some(seen) = seen.get_mut(observation.point) {
+            *seen = true;
+        }
+    }
+    seen.iter().filter(|seen| **seen).count()
+}

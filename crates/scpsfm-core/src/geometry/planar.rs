@@ -267,7 +267,7 @@ mod tests {
     fn homographies(seed: u64, views: usize, noise: f64) -> (testing::TestScene, Homographies) {
         let scene = testing::scene_of(seed, views, 30, noise, Motion::General, true);
         let seen = Correspondences::new(&scene.observations, views);
-        let found = seen.homographies_from(0, noise.max(1e-6)).expect("complete tracks");
+        let found = seen.homographies_from(0, noise.max(1e-6)).expect("complete tracks").views;
         let points = scene.observations.iter().filter(|seen| seen.view == 0).map(|seen| seen.xy).collect();
         (scene, Homographies { views: found, points })
     }

@@ -7,6 +7,13 @@ pub const GATE_QUANTILE: f64 = 3.090_232;
 pub const CHI_SQUARE_OF_ONE: f64 = 10.8;
 pub const CHI_SQUARE_OF_TWO: f64 = 13.8;
 
+/// Median of the norm of two independent normal coordinates (Rayleigh) in standard deviations.
+const RAYLEIGH_MEDIAN: f64 = 1.177_41;
+/// Share of the observations' freedom that must be left to the residuals for their noise to be believed. With less the
+/// fit decides what they are: a component of three points fitted these exactly, and closed the gates of all that came
+/// after it.
+const LEAST_FREEDOM: f64 = 0.2;
+
 /// Normal consistency of the median absolute deviation.
 pub const DEVIATION_PER_MEDIAN: f64 = 1.4826;
 
@@ -47,6 +54,13 @@ pub fn midpoint_median(values: &mut [f64]) -> f64 {
     }
     let upper = values[values.len() / 2..].iter().copied().fold(f64::INFINITY, f64::min);
     0.5 * (lower + upper)
+}
+
+/// Core noise, one standard deviation of a coordinate, by the median of these norms of residuals, for what their
+/// freedom leaves of it; `None` where that is next to nothing, as a few points fit any noise, and without residuals.
+pub fn core_noise(mut norms: Vec<f64>, unknowns: usize) -> Option<f64> {
+    let freedom = 1.0 - unknowns as f64 / (2 * norms.len()) as f64;
+    (freedom >= LEAST_FREEDOM).then(|| median(&mut norms) / RAYLEIGH_MEDIAN / freedom.sqrt())
 }
 
 /// `None` for no values.
@@ -99,5 +113,15 @@ mod tests {
         assert_eq!(midpoint_median(&mut [3.0, 1.0, 2.0]), 2.0);
         assert_eq!(midpoint_median(&mut [4.0, 1.0, 3.0, 2.0]), 2.5);
         assert_eq!(midpoint_median(&mut []), 0.0);
+    }
+
+    /// Two coordinates of each of 100 observations; with 198 unknowns the residuals are those that the fit has chosen.
+    #[test]
+    fn noise_is_told_by_residuals_that_have_freedom() {
+        let noise = |unknowns: usize| core_noise(vec![2.0 * RAYLEIGH_MEDIAN; 100], unknowns);
+        assert_eq!(noise(0), Some(2.0));
+        assert!(noise(100).is_some_and(|noise| (noise - 2.0 * 2f64.sqrt()).abs() < 1e-12));
+        assert_eq!(noise(198), None);
+        assert_eq!([0, 6].map(|unknowns| core_noise(Vec::new(), unknowns)), [None; 2]);
     }
 }

@@ -108,18 +108,20 @@ impl Assembled {
         structures: &[Structure],
         recorder: &mut Recorder,
     ) -> Result<Option<Self>, Error> {
-        let Self { reconstruction, judged, evidence, .. } = self;
-        let rival = second_structures::rival(problem, &reconstruction.geometry, judged, *evidence, structures)?;
+        let Self { reconstruction, judged, .. } = self;
+        let rival = second_structures::rival(problem, &reconstruction.geometry, judged, structures)?;
         let rival = rival.and_then(|ended| Self::of(ended, problem, recorder).ok());
-        Ok(rival.filter(|rival| rival.may_replace(self)))
+        Ok(rival.filter(|rival| rival.replaces(self, problem)))
     }
 
-    /// Whether it may be the result in place of one that it explains more than: where it is verified, not of static
-    /// tracks, and graded no worse. A calibration is of the camera, whatever moved before it.
-    fn may_replace(&self, other: &Self) -> bool {
-        let inliers = self.judged.tracks.inlier.iter().filter(|&&inlier| inlier).count();
-        let [own, others] = [self, other].map(|one| one.reconstruction.grade);
-        inliers >= LEAST_INLIERS && !self.reconstruction.geometry.of_static && own.is_no_worse_than(others)
+    /// Whether it is the result in place of another: where it is verified, has more tracks or the other is of static
+    /// ones, and is graded no worse. A calibration is of the camera, whatever moved before it.
+    fn replaces(&self, other: &Self, problem: &Problem) -> bool {
+        let [own, others] = [self, other].map(|one| second_structures::distinct(problem, &one.judged.tracks.inlier));
+        let is_static = |one: &Self| one.reconstruction.geometry.of_static;
+        let [grade, of_other] = [self, other].map(|one| one.reconstruction.grade);
+        let has_more = own > others || is_static(other);
+        own >= LEAST_INLIERS && has_more && !is_static(self) && grade.is_no_worse_than(of_other)
     }
 }
 

@@ -126,7 +126,7 @@ mod tests {
                 let plane = testing::scene_of(seed, 10, tracks, NOISE, Motion::General, true);
                 let points = plane.observations.iter().filter(|seen| seen.view == 0).map(|seen| seen.xy);
                 let seen = Correspondences::new(&plane.observations, 10);
-                let views = seen.homographies_from(0, NOISE).expect("complete tracks");
+                let views = seen.homographies_from(0, NOISE).expect("complete tracks").views;
                 let mut problem = Homographies { views, points: points.collect() };
                 testing::perturb(problem.points.iter_mut().flat_map(|point| point.iter_mut()), 0.01, seed);
                 both_end_at_the_same_cost::<9, 2>(&problem, &plane.observations, &case);

@@ -80,6 +80,11 @@ pub fn adjust(
     report
 }
 
+/// Unknowns of so many cameras and points that observations could determine: all but those of the frame.
+pub fn unknowns(cameras: usize, points: usize) -> usize {
+    (11 * cameras + 3 * points).saturating_sub(15)
+}
+
 #[cfg(test)]
 mod tests {
     use nalgebra::Vector2;

@@ -441,6 +441,7 @@ fn calibrate_projective(
         points: &some.points,
         observations: &some.observations,
         noise: some.noise,
+        outlier_density: problem.outlier_density,
         focal_per_view: problem.has_own_focals(),
         group_of: &group_of,
         focal_priors: &focal_priors,

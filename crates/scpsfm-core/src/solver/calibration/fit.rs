@@ -3,6 +3,7 @@
 use super::Uncalibrated;
 use super::options::FitOptions;
 use crate::geometry::bundle::metric::{IntrinsicsModel, MetricReconstruction};
+use crate::geometry::bundle::projective;
 
 /// The fit of a model that others are compared with.
 #[derive(Debug, Clone, Copy)]
@@ -28,7 +29,7 @@ impl Fit {
     ///
     /// * `others`: parameters that the points were made with
     pub fn projective(cost: f64, problem: &Uncalibrated, inliers: usize, others: usize) -> Self {
-        Self::new(cost, (11 * problem.cameras.len() + 3 * inliers + others).saturating_sub(15), problem)
+        Self::new(cost, projective::unknowns(problem.cameras.len(), inliers) + others, problem)
     }
 
     /// The fit of a metric reconstruction with these intrinsics of each group free.

@@ -23,7 +23,7 @@ use crate::geometry::bundle::critical::Homographies;
 use crate::geometry::bundle::metric::{Intrinsics, IntrinsicsModel, IntrinsicsPrior, MetricReconstruction, Parameter};
 use crate::geometry::bundle::{Options, projective};
 use crate::geometry::daq::to_canonical_frame;
-use crate::geometry::observation::Observation;
+use crate::geometry::observation::{self, Observation};
 use crate::geometry::planar;
 
 use super::Error;
@@ -43,6 +43,8 @@ pub struct Uncalibrated<'a> {
     pub observations: &'a [Observation],
     /// Assumed standard deviation of a coordinate, in normalised units.
     pub noise: f64,
+    /// Density of a wrong coordinate, see [`Problem::outlier_density`](super::problem::Problem::outlier_density).
+    pub outlier_density: f64,
     /// Camera group of each camera; the views of a group share their intrinsics.
     pub group_of: &'a [usize],
     /// What is known of the focal length of each group beforehand.
@@ -168,11 +170,17 @@ impl Outcome {
 /// # Errors
 /// [`Error::Stopped`] when `stop` fired; what stands by then is not worth returning.
 pub fn calibrate(problem: &Uncalibrated, scale_px: f64, stop: &StopToken) -> Result<Vec<Outcome>, Error> {
-    let problem = problem.with_least_noise();
-    let supported = critical::without_unsupported(&problem);
-    let problem = &Uncalibrated { observations: supported.as_deref().unwrap_or(problem.observations), ..problem };
-    let Compared { cameras, points, mut fit, critical, mut warnings } =
-        Compared::new(problem, problem, scale_px, stop, &mut || ())?;
+    let all = &problem.with_least_noise();
+    let supported = critical::without_unsupported(all, stop);
+    let of_supported = supported.as_ref().map(|observations| Uncalibrated { observations, ..*all });
+    let compared =
+        of_supported.as_ref().map(|some| Compared::new(some, some, scale_px, stop, &mut || ())).transpose()?;
+    // What is not supported may be the scene, where all else stands still in the image.
+    let (problem, compared) = match of_supported.as_ref().zip(compared).filter(|(_, compared)| compared.leads_on()) {
+        Some(found) => found,
+        None => (all, Compared::new(all, all, scale_px, stop, &mut || ())?),
+    };
+    let Compared { cameras, points, mut fit, critical, mut warnings } = compared;
     warnings.extend(critical.warnings);
     let choice = models::Choice { problem, scale_px, stop };
     if let Upgrade::Rotation { free, .. } = &critical.upgrade {
@@ -340,15 +348,14 @@ impl Compared {
         heartbeat();
         Ok(Self { cameras, points, fit, critical, warnings })
     }
+
+    /// Whether a calibration may come of it without anything that is known beforehand.
+    fn leads_on(&self) -> bool {
+        !matches!(self.critical.upgrade, Upgrade::Translation(_) | Upgrade::None)
+    }
 }
 
 /// Points with an observation.
 fn observed_points(problem: &Uncalibrated) -> usize {
-    let mut seen = vec![false; problem.points.len()];
-    for observation in problem.observations {
-        if let Some(seen) = seen.get_mut(observation.point) {
-            *seen = true;
-        }
-    }
-    seen.iter().filter(|seen| **seen).count()
+    observation::observed_points(problem.observations, problem.points.len())
 }

@@ -67,6 +67,9 @@ options! {
         /// that is nearly a plane. A little beyond the least of general motion: the tests that follow tell it from
         /// these, and a scene that is nearly a plane has starts from both.
         lens_limit: f64 = 12.0,
+        /// Share of the observations up to which those that homographies do not explain are a minority, and may be
+        /// wrong. Homographies explain views whose points fit but for the worst quarter.
+        most_unsupported: f64 = 0.25,
         /// Iterations of the projective cameras that a rotation behind a lens is tested against. They start where the
         /// lens was not undone.
         parallax_iterations: usize = 30,

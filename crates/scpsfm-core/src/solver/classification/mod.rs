@@ -8,7 +8,7 @@ mod noise;
 mod options;
 mod track_classifier;
 
-pub use noise::{NoiseModel, outlier_density, working_gate};
+pub use noise::{NoiseModel, evidence, outlier_density, working_gate};
 pub use options::ClassificationOptions;
 
 use std::ops::Range;

@@ -19,6 +19,16 @@ pub fn outlier_density(of_view: &[Vec<u32>], points: &[Vector2<f64>]) -> f64 {
     1.0 / (12.0f64.sqrt() * spread.clamp(OPTIONS.least_spread, MOST_SPREAD))
 }
 
+/// Logarithm of how much better this many observations fit than points anywhere in the image would, summed over the
+/// constraints that the unknowns leave: what one reconstruction of an input is preferred to another by.
+///
+/// * `noise`: one standard deviation of a coordinate
+/// * `outlier_density`: see [`outlier_density`]
+pub fn evidence(observations: usize, unknowns: usize, noise: f64, outlier_density: f64) -> f64 {
+    let constraints = (2 * observations) as f64 - unknowns as f64;
+    -constraints * (outlier_density * noise * (std::f64::consts::TAU * std::f64::consts::E).sqrt()).ln()
+}
+
 /// Squared residual within which an observation is more likely right than wrong while nothing is known of the noise's
 /// tail.
 pub fn working_gate(noise: f64, outlier_density: f64) -> f64 {

@@ -141,10 +141,11 @@ pub fn find(
     Ok(found)
 }
 
-/// What the input leads to without the inliers of a reconstruction, where one of its second structures explains more of
-/// it, and so does this: then that may be the scene, and the reconstruction a second structure.
+/// What the input leads to without the inliers of a reconstruction, where one of its second structures has more tracks
+/// in most of its views: then that may be the scene, and the reconstruction a second structure.
 ///
-/// * `evidence`: that of the reconstruction
+/// Tracks, not observations: a camera that walks round a body sees it all the time, and each point of the scene for a
+/// while.
 ///
 /// # Errors
 /// As [`find`].
@@ -152,16 +153,22 @@ pub fn rival(
     problem: &Problem,
     geometry: &Geometry,
     judged: &Judged,
-    evidence: f64,
     structures: &[Structure],
 ) -> Result<Option<Ended>, Error> {
-    // What stands still in the image is no scene where something else moves, however many tracks it has.
-    let explains_more = |other: f64| geometry.of_static || other > evidence;
-    if !structures.iter().any(|structure| explains_more(structure.evidence(problem))) {
-        return Ok(None);
-    }
-    let rival = solved_without(problem, &judged.tracks.inlier)?;
-    Ok(Some(rival).filter(|rival| explains_more(rival.evidence(problem))))
+    let views = geometry.component_of_view.iter().zip(&geometry.cameras);
+    let views = views.filter(|(component, camera)| **component == LARGEST && camera.is_some()).count();
+    let inliers = distinct(problem, &judged.tracks.inlier);
+    let may_be_scene = |structure: &Structure| {
+        let in_most_views = structure.reconstruction.as_ref().is_some_and(|found| 2 * found.views.len() >= views);
+        // What stands still in the image is no scene where something else moves, however many tracks it has.
+        geometry.of_static || in_most_views && distinct(problem, &structure.tracks) > inliers
+    };
+    structures.iter().any(may_be_scene).then(|| solved_without(problem, &judged.tracks.inlier)).transpose()
+}
+
+/// How many of these tracks there are, near-duplicates counted once.
+pub fn distinct(problem: &Problem, tracks: &[bool]) -> usize {
+    (0..tracks.len()).filter(|&track| tracks[track] && !problem.is_near_duplicate(track)).count()
 }
 
 /// Those of some tracks that make another projective reconstruction.

@@ -7,14 +7,12 @@ use super::options::{AdjustmentOptions, GrowthOptions};
 use crate::geometry::bundle::metric::{IntrinsicsModel, IntrinsicsPrior, MetricReconstruction};
 use crate::geometry::bundle::sequence::{self, Free, Run};
 use crate::geometry::observation::Observation;
-use crate::geometry::statistics::median;
+use crate::geometry::statistics::{core_noise, median};
 use crate::solver::problem::Problem;
 use crate::solver::recorder::Recorder;
 
 const OPTIONS: GrowthOptions = GrowthOptions::METRIC;
 const ADJUSTMENT: AdjustmentOptions = AdjustmentOptions::DEFAULT;
-/// Median of the norm of two independent normal coordinates (Rayleigh) in standard deviations.
-const RAYLEIGH_MEDIAN: f64 = 1.177_41;
 
 /// What of a model is adjusted together.
 pub struct Extract {
@@ -116,13 +114,6 @@ impl Extract {
         let norms = self.squared_residuals().into_iter().map(f64::sqrt).collect();
         core_noise(norms, self.sequence.unknowns(self.tracks.len(), 0))
     }
-}
-
-/// Core noise, one standard deviation of a coordinate, by the median of these norms of residuals, for what their
-/// freedom leaves of it; `None` where that is next to nothing, as a few points fit any noise, and without residuals.
-pub fn core_noise(mut norms: Vec<f64>, unknowns: usize) -> Option<f64> {
-    let freedom = 1.0 - unknowns as f64 / (2 * norms.len()) as f64;
-    (freedom >= ADJUSTMENT.least_freedom).then(|| median(&mut norms) / RAYLEIGH_MEDIAN / freedom.sqrt())
 }
 
 /// What is known of the intrinsics of a camera before any observation.
@@ -261,19 +252,4 @@ pub fn rescale(problem: &Problem, model: &mut Model, component: u32) {
     }
     let landmarks = model.landmarks.iter_mut().flatten().filter(|landmark| landmark.component == component);
     landmarks.for_each(|landmark| landmark.position *= scale);
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    /// Two coordinates of each of 100 observations; with 198 unknowns the residuals are those that the fit has chosen.
-    #[test]
-    fn noise_is_told_by_residuals_that_have_freedom() {
-        let noise = |unknowns: usize| core_noise(vec![2.0 * RAYLEIGH_MEDIAN; 100], unknowns);
-        assert_eq!(noise(0), Some(2.0));
-        assert!(noise(100).is_some_and(|noise| (noise - 2.0 * 2f64.sqrt()).abs() < 1e-12));
-        assert_eq!(noise(198), None);
-        assert_eq!([0, 6].map(|unknowns| core_noise(Vec::new(), unknowns)), [None; 2]);
-    }
 }

@@ -257,6 +257,7 @@ impl ProjectiveExtract {
             points: &self.points,
             observations,
             noise,
+            outlier_density: problem.outlier_density,
             group_of: &metric.group_of,
             focal_priors,
             focal_per_view: metric.has_own_focals(),

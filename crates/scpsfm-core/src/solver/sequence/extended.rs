@@ -3,11 +3,12 @@
 use super::model::Model;
 use super::options::{ExtensionOptions, GrowthOptions};
 use super::register;
-use super::{adjust, calibrate, components, growth, projective, structure};
+use super::{adjust, calibrate, components, growth, structure};
 use crate::domain::{Grade, LeftOut, Stage, Task, Warning, WarningCode};
 use crate::geometry::bundle::metric::MetricReconstruction;
 use crate::solver::attempt::{Attempt, AttemptOptions};
 use crate::solver::calibration::Outcome;
+use crate::solver::classification::evidence;
 use crate::solver::grow::LEAST_INLIERS;
 use crate::solver::problem::Problem;
 use crate::solver::recorder::Recorder;
@@ -102,14 +103,14 @@ impl Extended {
         (self.is_calibrated(problem) && self.fits(), self.evidence(problem))
     }
 
-    /// As [`projective::evidence`].
+    /// As [`evidence`].
     pub fn evidence(&self, problem: &Problem) -> f64 {
         let model = &self.model;
         let verified = adjust::verified(model);
         let observations = verified.iter().filter_map(|&track| model.landmarks[track]).map(|point| point.support).sum();
         let (of_view, of_point) = MetricReconstruction::unknowns_each(model.has_common_centre);
         let unknowns = of_view * model.registered().len() + of_point * verified.len();
-        projective::evidence(observations, unknowns, model.noise, problem.outlier_density)
+        evidence(observations, unknowns, model.noise, problem.outlier_density)
     }
 
     /// Whether nothing says that projective cameras would fit better.

@@ -8,7 +8,7 @@
 
 use std::f64::consts::SQRT_2;
 
-use super::projective::{self, ProjectiveReconstruction};
+use super::projective::ProjectiveReconstruction;
 use super::{Ended, Extended, QUICK_SEED, QuickPass};
 use crate::domain::Grade;
 use crate::geometry::bundle::metric::Intrinsics;
@@ -16,7 +16,7 @@ use crate::geometry::homography;
 use crate::solver::calibration::Outcome;
 use crate::solver::problem::{Problem, Undone};
 use crate::solver::recorder::Recorder;
-use crate::solver::{Error, attempt, view_selection};
+use crate::solver::{Error, attempt, classification, view_selection};
 
 options! {
     /// Which lenses are sampled, and when one is searched behind.
@@ -197,5 +197,5 @@ fn by_homographies(problem: &Problem, found: &ProjectiveReconstruction) -> Optio
     // Of two views.
     let noise = residual * found.noise / SQRT_2 * ln_scale.exp();
     let unknowns = HOMOGRAPHY_UNKNOWNS * (views - 1) + 2 * found.points.len();
-    Some(projective::evidence(observations.len(), unknowns, noise, problem.outlier_density))
+    Some(classification::evidence(observations.len(), unknowns, noise, problem.outlier_density))
 }

@@ -243,7 +243,7 @@ impl Ended {
             && lens::explains_enough(self.evidence(problem), of_pinholes.evidence(problem))
     }
 
-    /// How well the observations fit, see [`projective::evidence`].
+    /// How well the observations fit, see [`evidence`](super::classification::evidence).
     pub fn evidence(&self, problem: &Problem) -> f64 {
         match self {
             Ended::Extended(extended) => extended.evidence(problem),

@@ -84,10 +84,6 @@ options! {
         views_around: usize = 6,
         /// Iterations around a new view. They start at what was adjusted before.
         iterations_around: usize = 3,
-        /// Share of the observations' freedom that must be left to the residuals for their noise to be believed. With
-        /// less the fit decides what they are: a component of three points fitted these exactly, and closed the gates
-        /// of all that came after it.
-        least_freedom: f64 = 0.2,
         /// Least noise that is believed, pixels. Exact input would close every gate.
         least_noise_px: f64 = 0.01,
     }

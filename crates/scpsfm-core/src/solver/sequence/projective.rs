@@ -2,18 +2,16 @@
 
 use nalgebra::{Matrix4, Vector4};
 
-use super::adjust;
+use crate::geometry::bundle::projective;
 use crate::geometry::observation::Observation;
+use crate::geometry::statistics::core_noise;
 use crate::geometry::triangulation::weighted_squared;
 use crate::geometry::{Camera, Point};
 use crate::solver::block::Block;
+use crate::solver::classification::evidence;
 use crate::solver::grow::{self, Consensus};
 use crate::solver::problem::Problem;
 use crate::solver::view_selection::evenly;
-
-/// Unknowns of a projective camera, and of the frame that none of them tells.
-pub const CAMERA_UNKNOWNS: usize = 11;
-const GAUGE_UNKNOWNS: usize = 15;
 
 /// Cameras and points up to a common projective transform, with the observations that agree with them.
 #[derive(Debug, Clone)]
@@ -60,12 +58,12 @@ impl ProjectiveReconstruction {
             }
         }
         let norms = self.squared_residuals().into_iter().map(f64::sqrt).collect();
-        self.noise = adjust::core_noise(norms, self.unknowns()).unwrap_or(self.noise);
+        self.noise = core_noise(norms, self.unknowns()).unwrap_or(self.noise);
         self
     }
 
     fn unknowns(&self) -> usize {
-        CAMERA_UNKNOWNS * self.views.len() + 3 * self.tracks.len() - GAUGE_UNKNOWNS
+        projective::unknowns(self.views.len(), self.tracks.len())
     }
 
     /// The tracks with most observations, evenly among equals: a calibration takes no more than these.
@@ -151,16 +149,6 @@ impl ProjectiveReconstruction {
         }
         self
     }
-}
-
-/// Logarithm of how much better this many observations fit than points anywhere in the image would, summed over the
-/// constraints that the unknowns leave: what one reconstruction of an input is preferred to another by.
-///
-/// * `noise`: one standard deviation of a coordinate
-/// * `outlier_density`: see [`crate::solver::problem::Problem::outlier_density`]
-pub fn evidence(observations: usize, unknowns: usize, noise: f64, outlier_density: f64) -> f64 {
-    let constraints = (2 * observations) as f64 - unknowns as f64;
-    -constraints * (outlier_density * noise * (std::f64::consts::TAU * std::f64::consts::E).sqrt()).ln()
 }
 
 /// Rounds after which every camera and point that observations join to the first has a sign.

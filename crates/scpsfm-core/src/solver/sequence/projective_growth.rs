@@ -8,13 +8,13 @@ use nalgebra::Vector2;
 use rand::SeedableRng;
 use rand_chacha::ChaCha8Rng;
 
-use super::adjust;
 use super::growth::{self, Growth, Trial};
 use super::options::GrowthOptions;
-use super::projective::{CAMERA_UNKNOWNS, ProjectiveReconstruction};
+use super::projective::ProjectiveReconstruction;
 use crate::geometry::bundle;
 use crate::geometry::observation::Observation;
 use crate::geometry::robust_triangulation::{self, RobustPoint, Triangulator};
+use crate::geometry::statistics::core_noise;
 use crate::geometry::{Camera, Point, resection};
 use crate::solver::Error;
 use crate::solver::grow::NoiseOptions;
@@ -213,11 +213,11 @@ impl<'a> Growing<'a> {
             .for_each(|(&view, camera)| self.cameras[view] = Some(*camera));
     }
 
-    /// Core noise of the residuals within bounds, see [`adjust::core_noise`].
+    /// Core noise of the residuals within bounds, see [`core_noise`].
     fn noise_of(&self, reconstruction: &ProjectiveReconstruction) -> Option<f64> {
         let norms: Vec<f64> = reconstruction.squared_residuals().into_iter().map(f64::sqrt).collect();
-        let unknowns = CAMERA_UNKNOWNS * reconstruction.views.len() + 3 * reconstruction.tracks.len();
-        let noise = adjust::core_noise(norms, unknowns)?;
+        let unknowns = bundle::projective::unknowns(reconstruction.views.len(), reconstruction.tracks.len());
+        let noise = core_noise(norms, unknowns)?;
         let (least, most) = NoiseOptions::DEFAULT.bounds;
         Some(noise.clamp(least, (self.options.noise_growth * self.start_noise).min(most)))
     }

@@ -140,6 +140,59 @@ fn one_wrong_track_gives_a_rotation_no_depth() {
     }
 }
 
+/// Tracks that slid along the epipolar lines of a view, which projective cameras fit, and links to other points, of
+/// which they fit as many as they have fourth columns for.
+#[test]
+fn what_homographies_do_not_explain_is_left_out_where_it_is_wrong() {
+    let mut found = 0;
+    for (motion, planar) in [(Motion::General, true), (Motion::Rotation, false)] {
+        for seed in 0..10 {
+            let mut scene = testing::scene_of(seed, 8, 60, NOISE, motion, planar);
+            let is_slid = |seen: &Observation| seen.view == 4 && seen.point < 9;
+            let is_linked = |seen: &Observation| seen.view >= 5 && (9..11).contains(&seen.point);
+            for seen in scene.observations.iter_mut().filter(|seen| is_slid(seen)) {
+                seen.xy += Vector2::new(0.06, 0.02) * (1.0 + 0.2 * seen.point as f64);
+            }
+            let right = scene.observations.clone();
+            for seen in scene.observations.iter_mut().filter(|seen| is_linked(seen)) {
+                seen.xy = right[seen.view * scene.points.len() + seen.point + 30].xy;
+            }
+            let Some(kept) = supported(&scene) else { continue };
+            found += 1;
+            let is_wrong = |seen: &Observation| is_slid(seen) || is_linked(seen);
+            let (wrong, lost) =
+                (kept.iter().filter(|seen| is_wrong(seen)).count(), scene.observations.len() - kept.len());
+            println!("{motion:?}, planar {planar}, seed {seed}: {wrong} wrong kept, {lost} left out");
+            assert!(wrong == 0, "{motion:?}, planar {planar}, seed {seed}: {wrong} wrong ones kept");
+            assert!((15..=17).contains(&lost), "{motion:?}, planar {planar}, seed {seed}: {lost} left out");
+        }
+    }
+    // Wrong ones may keep a homography from being found.
+    assert!(found >= 18, "{found} of 20");
+}
+
+/// That a few points are nearer than all others is parallax, which the cameras agree on.
+#[test]
+fn parallax_of_a_tenth_of_the_points_is_not_left_out() {
+    for seed in 0..10 {
+        let mut scene = testing::scene_of(seed, 10, 60, 0.0, Motion::Rotation, false);
+        for (view, pose) in scene.poses.iter_mut().enumerate() {
+            pose.translation += Vector3::new((2.3 * view as f64).sin(), (4.1 * view as f64).cos(), 0.0) * 0.3;
+        }
+        scene.points.iter_mut().skip(10).for_each(|point| *point *= 1e4);
+        scene.observe(NOISE, &mut rand_chacha::ChaCha8Rng::seed_from_u64(seed));
+        assert!(supported(&scene).is_none(), "seed {seed}");
+    }
+}
+
+/// The observations of a scene that are supported, against its projective cameras.
+fn supported(scene: &TestScene) -> Option<Vec<Observation>> {
+    let cameras = scene.cameras();
+    let points: Vec<Vector4<f64>> = scene.points.iter().map(|point| point.push(1.0)).collect();
+    let problem = of_one_lens(&cameras, &points, &scene.observations, NOISE);
+    crate::solver::calibration::critical::without_unsupported(&problem, &StopToken::default())
+}
+
 /// Homographies of a plane have room for a focal length of each view of a camera that only turns.
 #[test]
 fn a_camera_that_turns_and_zooms_is_not_taken_for_one_before_a_plane() {

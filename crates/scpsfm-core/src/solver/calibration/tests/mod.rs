@@ -33,6 +33,7 @@ pub fn of_one_lens<'a>(
         points,
         observations,
         noise,
+        outlier_density: 1.0,
         group_of,
         focal_priors: &[None],
         focal_per_view: false,
