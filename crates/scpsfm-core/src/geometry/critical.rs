@@ -12,7 +12,7 @@ use super::bundle::metric::{self, Intrinsics, IntrinsicsModel, IntrinsicsPrior, 
 use super::bundle::{Loss, Options};
 use super::daq::scan_focal;
 use super::fundamental::{Fundamental, Match};
-use super::homography::{Correspondences, LEAST_COMMON};
+use super::homography::{CAUCHY_SCALE, Correspondences, LEAST_COMMON};
 use super::null_vector::smallest_eigenvector;
 use super::observation::{Observation, observed_points};
 use super::procrustes::nearest_rotation;
@@ -21,15 +21,15 @@ use crate::domain::StopToken;
 
 /// Focal lengths from which a rotation is looked for; neighbours are a fifth apart.
 const FOCALS: usize = 16;
-/// Rounds of reweighting by which a view is turned to what others have placed.
+/// Rounds of reweighting by which a view is turned to what others have placed: as many as of homographies.
 const TURNING_ROUNDS: usize = 5;
+/// What an observation counts for at most where focal lengths are compared: it cannot be farther off than the image is
+/// long.
+const MOST_MISSED: f64 = 1.0;
 /// Rounds of alternation for the depths of a translation's start; the adjustment does the rest.
 const DEPTH_ROUNDS: usize = 10;
 /// Iterations of each adjustment: they start near the minimum, or the model is wrong and its cost only has to show it.
 const ITERATIONS: usize = 30;
-
-/// Scale of the Cauchy loss of homographies in units of the noise: a wrong observation pulls as if it were that far off.
-const CAUCHY_SCALE: f64 = 3.0;
 
 /// A model at its minimum.
 #[derive(Debug, Clone)]
@@ -63,19 +63,19 @@ impl ReferenceHomographies {
         Some(Self { views: placed.views, positions })
     }
 
-    /// How far homographies miss each observation, squared and weighted, once they are adjusted under a loss that bounds
-    /// what a minority of the observations can do.
+    /// Squared residuals of the observations, weighted, of homographies that are adjusted under a loss that bounds what a
+    /// minority of them can do.
     ///
     /// * `noise`: one standard deviation of a coordinate, normalised units
-    pub fn missed(&self, observations: &[Observation], noise: f64, stop: &StopToken) -> Vec<f64> {
+    pub fn squared_residuals(&self, observations: &[Observation], noise: f64, stop: &StopToken) -> Vec<f64> {
         let mut adjusted = self.homographies();
         let loss = Loss::Cauchy { scale: CAUCHY_SCALE * noise };
         minimise(&mut adjusted, observations, &Options { loss, ..Options::squared(ITERATIONS) }, stop);
-        let missed = |seen: &Observation| {
+        let squared = |seen: &Observation| {
             let moved = adjusted.views.get(seen.view)? * adjusted.points.get(seen.point)?.push(1.0);
             Some(seen.weight * (moved.xy() / moved.z - seen.xy).norm_squared())
         };
-        observations.iter().map(|seen| missed(seen).unwrap_or(f64::INFINITY)).collect()
+        observations.iter().map(|seen| squared(seen).unwrap_or(f64::INFINITY)).collect()
     }
 
     fn homographies(&self) -> Homographies {
@@ -104,7 +104,7 @@ pub fn fit_plane(
 
 /// Fits a camera that only turns, first with its focal length alone free, then with this model.
 ///
-/// * `start`: see [`turning`]
+/// * `start`: see [`rotation_start`]
 /// * `group_of`: camera group of each view
 /// * `priors`: of the intrinsics of each group
 ///
@@ -165,21 +165,26 @@ pub fn fit_homographies(
 }
 
 /// A camera that only turned, its principal point in the centre, from the focal length that explains the views best:
-/// what [`fit_rotation`] starts from. A rotation is placed by fewer points, and farther from these, than a homography.
+/// what [`fit_rotation`] starts from. A rotation holds farther from the points that it is found by than a homography.
 ///
 /// Returns `None` where common points do not tie all views together.
-pub fn turning(observations: &[Observation], views: usize, points: usize, noise: f64) -> Option<MetricReconstruction> {
+pub fn rotation_start(
+    observations: &[Observation],
+    views: usize,
+    points: usize,
+    noise: f64,
+) -> Option<MetricReconstruction> {
     let seen = Correspondences::new(observations, views);
     let reference = seen.most_observed()?;
     let of_focal = |k: usize| {
         let intrinsics = Intrinsics::from_focal(scan_focal(k, FOCALS));
         let matrix = intrinsics.matrix();
         let placed = seen.placed((reference, matrix), |seen| Some(matrix * rotation_of(seen, &intrinsics, noise)?))?;
-        let missed = |seen: &Observation| {
+        let distance = |seen: &Observation| {
             let moved = placed.views.get(seen.view)? * (*placed.points.get(seen.point)?)?;
-            Some((moved.xy() / moved.z - seen.xy).norm()).filter(|missed| missed.is_finite())
+            Some((moved.xy() / moved.z - seen.xy).norm().min(MOST_MISSED))
         };
-        let missed: f64 = observations.iter().filter_map(missed).sum();
+        let missed: f64 = observations.iter().filter_map(distance).sum();
         Some((missed, intrinsics, placed))
     };
     let (_, intrinsics, placed) = (0..FOCALS).filter_map(of_focal).min_by(|a, b| a.0.total_cmp(&b.0))?;
@@ -188,8 +193,8 @@ pub fn turning(observations: &[Observation], views: usize, points: usize, noise:
     let mut directions: Vec<Vector3<f64>> =
         placed.points.into_iter().map(|point| point.unwrap_or_else(Vector3::z)).collect();
     directions.resize(points, Vector3::z());
-    let turning = MetricReconstruction::new(intrinsics, placed.views.iter().map(pose).collect(), directions);
-    Some(MetricReconstruction { has_common_centre: true, ..turning })
+    let start = MetricReconstruction::new(intrinsics, placed.views.iter().map(pose).collect(), directions);
+    Some(MetricReconstruction { has_common_centre: true, ..start })
 }
 
 /// The rotation that takes directions to where a camera sees them, by least absolute deviations (Weiszfeld 1937): some
@@ -208,7 +213,7 @@ fn rotation_of(seen: &[(Vector3<f64>, Vector2<f64>)], intrinsics: &Intrinsics, n
         rotation = nearest_rotation(&moment)?;
         for ((direction, xy), weight) in seen.iter().zip(&mut weights) {
             let missed = (rotation * direction - (xy / intrinsics.focal).push(1.0).normalize()).norm();
-            *weight = (missed * intrinsics.focal).max(noise).recip();
+            *weight = (missed * intrinsics.focal).max(noise.max(f64::EPSILON)).recip();
         }
     }
     Some(rotation)
@@ -348,7 +353,7 @@ mod tests {
             |cost: f64, unknowns: usize| cost / (noise * noise * (2 * scene.observations.len() - unknowns) as f64);
         let start = ReferenceHomographies::new(&scene.observations, views, points, noise).expect("complete tracks");
         let plane = fit_plane(&start, &scene.observations, &stop);
-        let turning = turning(&scene.observations, views, points, noise).expect("complete tracks");
+        let turning = rotation_start(&scene.observations, views, points, noise).expect("complete tracks");
         let turning =
             fit_rotation(&turning, &scene.observations, &vec![0; views], FULL, &PRIORS, &stop).expect("turns");
         let moving = fit_translation(&scene.observations, views, points, noise, f64::INFINITY, &stop);
@@ -400,7 +405,7 @@ mod tests {
         if let Some(start) = ReferenceHomographies::new(&scene.observations, 8, 40, NOISE) {
             fit_plane(&start, &scene.observations, &stop);
         }
-        if let Some(start) = turning(&scene.observations, 8, 40, NOISE) {
+        if let Some(start) = rotation_start(&scene.observations, 8, 40, NOISE) {
             fit_rotation(&start, &scene.observations, &[0; 8], FULL, &PRIORS, &stop);
             assert!(fit_rotation(&start, &scene.observations, &[1; 8], FULL, &PRIORS, &stop).is_none());
         }

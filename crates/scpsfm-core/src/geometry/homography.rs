@@ -7,12 +7,13 @@ use super::null_vector::{projection_equations, smallest_eigenvector};
 use super::observation::Observation;
 use super::statistics::median;
 
-/// Common points that a pair of views needs: two more than the four that a homography always fits.
+/// Points that a view is placed by, and that a pair of views needs in common: two more than the four that a homography
+/// always fits.
 pub const LEAST_COMMON: usize = 6;
 /// Rounds of the reweighted direct linear transform; prototypes settle in three.
 const ROUNDS: usize = 5;
 /// Scale of the Cauchy weights in units of the noise of a transferred point.
-const CAUCHY_SCALE: f64 = 3.0;
+pub const CAUCHY_SCALE: f64 = 3.0;
 /// The 75 % quantile of a Rayleigh distribution with unit parameter, `sqrt(2 ln 4)`. The quantile asks three quarters
 /// of the points, so that a dominant plane alone is not taken for a planar scene, nor a wrong track for depth.
 const QUANTILE: f64 = 0.75;
@@ -73,7 +74,7 @@ impl Correspondences {
     ///
     /// A view that shares few points with any one other may share enough with all of them together.
     ///
-    /// * `first`: what takes points to the images of the view that is placed first
+    /// * `reference`, `first`: the view that is placed first, and what takes points to its images
     /// * `place`: the same of another view, from points and where it sees them
     ///
     /// Returns `None` where a view cannot be placed.

@@ -114,14 +114,17 @@ impl Assembled {
         Ok(rival.filter(|rival| rival.replaces(self, problem)))
     }
 
-    /// Whether it is the result in place of another: where it is verified, has more tracks or the other is of static
-    /// ones, and is graded no worse. A calibration is of the camera, whatever moved before it.
+    /// Whether it is the result in place of another: where it is verified, has more tracks in most of its views or the
+    /// other is of static ones, and is graded no worse. A calibration is of the camera, whatever moved before it.
     fn replaces(&self, other: &Self, problem: &Problem) -> bool {
-        let [own, others] = [self, other].map(|one| second_structures::distinct(problem, &one.judged.tracks.inlier));
-        let is_static = |one: &Self| one.reconstruction.geometry.of_static;
-        let [grade, of_other] = [self, other].map(|one| one.reconstruction.grade);
-        let has_more = own > others || is_static(other);
-        own >= LEAST_INLIERS && has_more && !is_static(self) && grade.is_no_worse_than(of_other)
+        let count = |one: &Self| second_structures::distinct_count(problem, &one.judged.tracks.inlier);
+        let [geometry, of_other] = [self, other].map(|one| &one.reconstruction.geometry);
+        let views = second_structures::views_of_largest(geometry);
+        let has_more = count(self) > count(other) && second_structures::are_most(views, of_other);
+        count(self) >= LEAST_INLIERS
+            && (has_more || of_other.of_static)
+            && !geometry.of_static
+            && self.reconstruction.grade.is_no_worse_than(other.reconstruction.grade)
     }
 }
 

@@ -14,7 +14,7 @@ use crate::geometry::bundle::critical::{Homographies, Translating};
 use crate::geometry::bundle::metric::{Extension, IntrinsicsModel, IntrinsicsPrior, MetricReconstruction};
 use crate::geometry::bundle::projective;
 use crate::geometry::critical::{self, ReferenceHomographies};
-use crate::geometry::homography;
+use crate::geometry::homography::{self, LEAST_COMMON};
 use crate::geometry::observation::{Observation, observed_points};
 use crate::geometry::statistics::{CHI_SQUARE_OF_TWO, core_noise};
 use crate::solver::classification::evidence;
@@ -54,22 +54,30 @@ pub(super) fn without_unsupported(problem: &Uncalibrated, stop: &StopToken) -> O
     let (views, points) = (problem.cameras.len(), problem.points.len());
     homography::median_residual(observations, views, noise, problem.options.critical.lens_limit)?;
     let start = ReferenceHomographies::new(observations, views, points, noise)?;
-    let missed = start.missed(observations, noise, stop);
-    let noise_of_homographies = core_noise(missed.iter().map(|missed| missed.sqrt()).collect(), start.unknowns())?;
+    let squared = start.squared_residuals(observations, noise, stop);
+    let noise_of_homographies = core_noise(squared.iter().map(|squared| squared.sqrt()).collect(), start.unknowns())?;
     let limit = CHI_SQUARE_OF_TWO * noise_of_homographies.powi(2);
     let mut explained = vec![0; points];
-    for (seen, _) in observations.iter().zip(&missed).filter(|(_, missed)| **missed < limit) {
+    for (seen, _) in observations.iter().zip(&squared).filter(|(_, squared)| **squared < limit) {
         explained[seen.point] += 1;
     }
-    let is_kept = |(seen, missed): &(&Observation, &f64)| **missed < limit && explained[seen.point] >= VERIFIED;
-    let kept: Vec<Observation> = observations.iter().zip(&missed).filter(is_kept).map(|(seen, _)| *seen).collect();
-    let lost = observed_points(observations, points) - observed_points(&kept, points);
-    let of_homographies = evidence(kept.len(), start.unknowns() - 2 * lost, noise_of_homographies, outlier_density);
-    let unknowns = projective::unknowns(views, observed_points(observations, points));
-    let of_all = evidence(observations.len(), unknowns, noise, outlier_density);
-    let least = (1.0 - problem.options.critical.most_unsupported) * observations.len() as f64;
-    let explains_most = kept.len() as f64 >= least && kept.len() < observations.len();
-    (explains_most && of_homographies > of_all).then_some(kept)
+    let is_kept = |(seen, squared): &(&Observation, &f64)| **squared < limit && explained[seen.point] >= VERIFIED;
+    let kept: Vec<Observation> = observations.iter().zip(&squared).filter(is_kept).map(|(seen, _)| *seen).collect();
+    let options = problem.options;
+    let [inliers, kept_inliers] = [observations, &kept].map(|seen| observed_points(seen, points));
+    let least = (1.0 - options.critical.most_unsupported) * observations.len() as f64;
+    let mut of_view = vec![0; views];
+    kept.iter().for_each(|seen| of_view[seen.view] += 1);
+    let is_enough = kept.len() as f64 >= least
+        && kept_inliers >= options.fit.least_inliers
+        && of_view.iter().all(|count| *count >= LEAST_COMMON);
+    if !is_enough || kept.len() == observations.len() {
+        return None;
+    }
+    let unknowns = start.unknowns().saturating_sub(2 * (inliers - kept_inliers));
+    let of_homographies = evidence(kept.len(), unknowns, noise_of_homographies, outlier_density);
+    let of_all = evidence(observations.len(), projective::unknowns(views, inliers), noise, outlier_density);
+    (of_homographies > of_all).then_some(kept)
 }
 
 /// What kind of motion and scene the views of this consensus show.
@@ -129,12 +137,12 @@ fn without_parallax(
     let priors = choice.priors(fit.noise);
     let fits = || {
         let plane = ReferenceHomographies::new(observations, views, points, fit.noise)?;
-        let turning = critical::turning(observations, views, points, fit.noise)?;
+        let start = critical::rotation_start(observations, views, points, fit.noise)?;
         let model = IntrinsicsModel::focal(focal_per_view).with_all_extensions();
-        let rotation = critical::fit_rotation(&turning, observations, group_of, model, &priors, stop)?;
-        Some((critical::fit_plane(&plane, observations, stop), rotation, turning))
+        let rotation = critical::fit_rotation(&start, observations, group_of, model, &priors, stop)?;
+        Some((critical::fit_plane(&plane, observations, stop), rotation, start))
     };
-    let Some((plane, rotation, turning)) = fits() else {
+    let Some((plane, rotation, start)) = fits() else {
         if !is_flat {
             return ControlFlow::Continue(None);
         }
@@ -157,7 +165,7 @@ fn without_parallax(
     if !turns && (!is_flat || translates && has_depth) {
         return ControlFlow::Continue(Some(plane.model));
     }
-    if !turns && !translates && !has_depth && !focal_per_view && turns_and_zooms(choice, &turning, &by_plane, &priors) {
+    if !turns && !translates && !has_depth && !focal_per_view && turns_and_zooms(choice, &start, &by_plane, &priors) {
         let detail = format!("{missed}: a camera that turns and zooms explains the views as well as they do");
         let reason = "a camera that turned and zoomed has other focal lengths than one that moved before a plane: solve \
                       with a focal length a view (focal_per_view) if it zoomed";
@@ -200,17 +208,12 @@ fn without_parallax(
 }
 
 /// Whether a camera that only turns, with a focal length of each view, fits as well as homographies.
-fn turns_and_zooms(
-    choice: &Choice,
-    turning: &MetricReconstruction,
-    by_plane: &Fit,
-    priors: &[IntrinsicsPrior],
-) -> bool {
+fn turns_and_zooms(choice: &Choice, start: &MetricReconstruction, by_plane: &Fit, priors: &[IntrinsicsPrior]) -> bool {
     let Choice { problem, stop, .. } = *choice;
     // What a lens adds to these would explain a plane too.
     let model = IntrinsicsModel::FOCAL_PER_VIEW.with(Extension::PrincipalPoint);
     let of_one = vec![0; problem.cameras.len()];
-    let found = critical::fit_rotation(turning, problem.observations, &of_one, model, &priors[..1], stop);
+    let found = critical::fit_rotation(start, problem.observations, &of_one, model, &priors[..1], stop);
     found.is_some_and(|found| {
         let fit = Fit::new(found.cost, found.unknowns, problem);
         fit.freedom > by_plane.freedom && !by_plane.refutes(&fit, &problem.options.fit)

@@ -40,7 +40,7 @@ impl Fit {
         problem: &Uncalibrated,
     ) -> Self {
         let shared = model.parameters().len() * problem.groups();
-        Self::new(cost, reconstruction.unknowns(super::observed_points(problem), shared), problem)
+        Self::new(cost, reconstruction.unknowns(problem.observed_points(), shared), problem)
     }
 
     /// How much worse a special case of this model fits than chance would have it, in standard deviations of the F
@@ -60,7 +60,7 @@ impl Fit {
     /// the `3 m + n` of as many unknowns. On rotations of 3 to 39 views the statistic was up to 12.9 without this, up to
     /// 5.5 with it; with parallax 215 and more.
     pub fn parallax_deviations(&self, special: &Fit, problem: &Uncalibrated) -> f64 {
-        let (views, points) = (problem.cameras.len() as f64, super::observed_points(problem) as f64);
+        let (views, points) = (problem.cameras.len() as f64, problem.observed_points() as f64);
         let by_chance = 2.0 * (3.0 * views * points).sqrt();
         self.loss_deviations(special.cost - by_chance * self.noise * self.noise, special.freedom)
     }

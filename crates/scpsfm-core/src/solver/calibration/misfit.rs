@@ -2,10 +2,10 @@
 
 use nalgebra::Vector4;
 
+use super::Uncalibrated;
 use super::fit::Fit;
 use super::models::{Candidate, Choice};
 use super::options::FitOptions;
-use super::{Uncalibrated, observed_points};
 use crate::domain::StopToken;
 use crate::geometry::bundle::metric::{self, Extension, Intrinsics, IntrinsicsPrior, MetricReconstruction};
 use crate::geometry::bundle::{Options, projective};
@@ -86,7 +86,7 @@ fn undistorted_fits(best: &Candidate, choice: &Choice) -> Option<(Fit, Fit)> {
     let projective = match pinhole.has_common_centre {
         true => {
             let (start, iterations) = (critical::homographies_of(&pinhole)?, options.max_iterations);
-            let observed = observed_points(problem);
+            let observed = problem.observed_points();
             let found = critical::fit_homographies(start, observed, &observations, iterations, choice.stop);
             Fit::new(found.cost, found.unknowns + terms, problem)
         }
@@ -125,7 +125,7 @@ fn projective_fit(
 ) -> Fit {
     let (mut cameras, mut points) = (cameras.to_vec(), points.to_vec());
     let report = projective::adjust(&mut cameras, &mut points, problem.observations, options, stop);
-    Fit::projective(report.cost, problem, observed_points(problem), terms)
+    Fit::projective(report.cost, problem, problem.observed_points(), terms)
 }
 
 /// The observations where pinholes would have made them; without those that the lens images nowhere.

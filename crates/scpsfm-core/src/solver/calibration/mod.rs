@@ -60,6 +60,11 @@ impl Uncalibrated<'_> {
         self.focal_priors.len()
     }
 
+    /// How many points have an observation.
+    fn observed_points(&self) -> usize {
+        observation::observed_points(self.observations, self.points.len())
+    }
+
     /// The same with a noise that has a meaning.
     fn with_least_noise(&self) -> Self {
         Self { noise: self.noise.max(self.options.fit.least_noise), ..*self }
@@ -176,9 +181,9 @@ pub fn calibrate(problem: &Uncalibrated, scale_px: f64, stop: &StopToken) -> Res
     let compared =
         of_supported.as_ref().map(|some| Compared::new(some, some, scale_px, stop, &mut || ())).transpose()?;
     // What is not supported may be the scene, where all else stands still in the image.
-    let (problem, compared) = match of_supported.as_ref().zip(compared).filter(|(_, compared)| compared.leads_on()) {
-        Some(found) => found,
-        None => (all, Compared::new(all, all, scale_px, stop, &mut || ())?),
+    let (problem, compared) = match of_supported.as_ref().zip(compared) {
+        Some(found) if !found.1.shows_little_motion() => found,
+        _ => (all, Compared::new(all, all, scale_px, stop, &mut || ())?),
     };
     let Compared { cameras, points, mut fit, critical, mut warnings } = compared;
     warnings.extend(critical.warnings);
@@ -335,12 +340,12 @@ impl Compared {
     ) -> Result<Self, Error> {
         Error::check(stop)?;
         let options = &problem.options.fit;
-        let inliers = observed_points(problem);
+        let inliers = problem.observed_points();
         let warnings = if inliers < options.least_inliers { vec![few_inliers(inliers, options)] } else { Vec::new() };
         let (mut cameras, mut points) = (on.cameras.to_vec(), on.points.to_vec());
         let adjustment = Options::squared(options.projective_iterations);
         let report = projective::adjust(&mut cameras, &mut points, on.observations, &adjustment, stop);
-        let fit = Fit::projective(report.cost, on, observed_points(on), 0);
+        let fit = Fit::projective(report.cost, on, on.observed_points(), 0);
         Error::check(stop)?;
         heartbeat();
         let critical = critical::find(&models::Choice { problem: on, scale_px, stop }, &fit);
@@ -349,13 +354,7 @@ impl Compared {
         Ok(Self { cameras, points, fit, critical, warnings })
     }
 
-    /// Whether a calibration may come of it without anything that is known beforehand.
-    fn leads_on(&self) -> bool {
-        !matches!(self.critical.upgrade, Upgrade::Translation(_) | Upgrade::None)
+    fn shows_little_motion(&self) -> bool {
+        self.critical.warnings.iter().any(|warning| warning.code == WarningCode::LittleMotion)
     }
-}
-
-/// Points with an observation.
-fn observed_points(problem: &Uncalibrated) -> usize {
-    observation::observed_points(problem.observations, problem.points.len())
 }

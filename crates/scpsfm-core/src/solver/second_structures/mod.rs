@@ -37,6 +37,9 @@ options! {
         /// Evidence, at least, as a share of that of the reconstruction. Of 280 photographed scenes, drifting tracks of
         /// four had .01 to .03 in a few views; of 31 second bodies 27 had .07 and more, one .01, and three none.
         least_share: f64 = 0.05,
+        /// Share of the views of a reconstruction from which another one may be the scene in its place: many tracks in
+        /// few views are less of it.
+        most_views: f64 = 0.5,
         /// Tracks of a block from which the first structure is searched only where more than four of them fit affine
         /// cameras. In smaller blocks perspective hides that, and their search takes 10 to 20 ms; that of 190 wrong
         /// tracks took five times as long as the rest of an easy solve.
@@ -155,19 +158,29 @@ pub fn rival(
     judged: &Judged,
     structures: &[Structure],
 ) -> Result<Option<Ended>, Error> {
-    let views = geometry.component_of_view.iter().zip(&geometry.cameras);
-    let views = views.filter(|(component, camera)| **component == LARGEST && camera.is_some()).count();
-    let inliers = distinct(problem, &judged.tracks.inlier);
+    let inliers = distinct_count(problem, &judged.tracks.inlier);
     let may_be_scene = |structure: &Structure| {
-        let in_most_views = structure.reconstruction.as_ref().is_some_and(|found| 2 * found.views.len() >= views);
+        let views = structure.reconstruction.as_ref().map_or(0, |found| found.views.len());
+        let in_most_views = are_most(views, geometry);
         // What stands still in the image is no scene where something else moves, however many tracks it has.
-        geometry.of_static || in_most_views && distinct(problem, &structure.tracks) > inliers
+        geometry.of_static || in_most_views && distinct_count(problem, &structure.tracks) > inliers
     };
     structures.iter().any(may_be_scene).then(|| solved_without(problem, &judged.tracks.inlier)).transpose()
 }
 
+/// Whether so many views are most of those of a reconstruction.
+pub fn are_most(views: usize, of: &Geometry) -> bool {
+    views as f64 >= OPTIONS.most_views * views_of_largest(of) as f64
+}
+
+/// Registered views of the largest component.
+pub fn views_of_largest(geometry: &Geometry) -> usize {
+    let views = geometry.component_of_view.iter().zip(&geometry.cameras);
+    views.filter(|(component, camera)| **component == LARGEST && camera.is_some()).count()
+}
+
 /// How many of these tracks there are, near-duplicates counted once.
-pub fn distinct(problem: &Problem, tracks: &[bool]) -> usize {
+pub fn distinct_count(problem: &Problem, tracks: &[bool]) -> usize {
     (0..tracks.len()).filter(|&track| tracks[track] && !problem.is_near_duplicate(track)).count()
 }
 

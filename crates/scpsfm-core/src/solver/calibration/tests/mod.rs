@@ -253,6 +253,9 @@ fn hostile_input_is_refused_without_panic() {
     let huge: Vec<_> = cameras.iter().map(|camera| camera * 1e200).collect();
     run(&huge, &points, &scene.observations, NOISE);
     run(&cameras, &points, &scene.observations, 0.0);
+    let mut undefined = testing::scene_of(1, 4, 12, NOISE, Motion::Rotation, false).observations;
+    undefined.iter_mut().filter(|seen| seen.point < 3).for_each(|seen| seen.xy.x = f64::NAN);
+    run(&cameras, &points, &undefined, NOISE);
 }
 
 #[test]
