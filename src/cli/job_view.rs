@@ -19,7 +19,7 @@ use crate::domain::{Grade, InputName, Status, Warning, Webhook};
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub enum GivenName {
     Whole(JobName),
-    /// Of the tenant that calls; `tenants/-/` is such a name too, which a lost server leaves.
+    /// Of the tenant that calls; see [`own_id`].
     Id(String),
 }
 
@@ -27,10 +27,9 @@ impl GivenName {
     /// # Errors
     /// For what is neither.
     pub fn parse(text: &str) -> Result<Self, String> {
-        let id = text.strip_prefix("tenants/-/jobs/").unwrap_or(text);
-        let given = match id.contains('/') {
-            true => JobName::parse(text).map(Self::Whole),
-            false => JobName::is_id(id).then(|| Self::Id(id.to_owned())),
+        let given = match own_id(text, "jobs") {
+            Some(id) => Some(Self::Id(id.to_owned())),
+            None => JobName::parse(text).map(Self::Whole),
         };
         given.ok_or_else(|| format!("{text:?} is not a job's name, such as tenants/default/jobs/a1b2"))
     }
@@ -45,6 +44,14 @@ impl GivenName {
             Self::Id(job) => Ok(JobName { tenant: access.tenant()?, job: job.clone() }),
         }
     }
+}
+
+/// The last part of a name of the tenant that calls, of this collection: given alone, or after `tenants/-/`, as the
+/// commands print it where the key names the tenant.
+pub fn own_id<'a>(text: &'a str, collection: &str) -> Option<&'a str> {
+    let after = text.strip_prefix("tenants/-/").and_then(|rest| rest.strip_prefix(collection)?.strip_prefix('/'));
+    let id = after.unwrap_or(text);
+    JobName::is_id(id).then_some(id)
 }
 
 /// What ended a job that is DEADLINE_EXCEEDED.
@@ -333,6 +340,8 @@ mod tests {
         assert_eq!(of("tenants/-/jobs/a-1", None).as_deref(), Ok("tenants/default/jobs/a-1"));
         assert!(of("A", None).is_err());
         assert!(of("jobs/a", None).is_err());
+        assert!(of("tenants/-/inputs/a", None).is_err());
+        assert!(of("tenants/-/jobs/", None).is_err());
     }
 
     #[test]

@@ -13,7 +13,6 @@ use super::input_args::{ReadingArgs, tell_notes};
 use super::settings_args::SettingsArgs;
 use super::{job_view, print, remote};
 use crate::client::JobOptions;
-use crate::domain::job::JobName;
 use crate::domain::{InputName, Webhook};
 use crate::formats::STANDARD_INPUT;
 use crate::rpc::convert::create::MAX_PRIORITY;
@@ -141,7 +140,7 @@ pub async fn run(args: Args) -> Result<Exit, Failure> {
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub enum GivenInput {
     Whole(InputName),
-    /// Of the tenant that calls.
+    /// Of the tenant that calls; see [`job_view::own_id`].
     Id(String),
 }
 
@@ -149,9 +148,9 @@ impl GivenInput {
     /// # Errors
     /// For what is neither.
     pub fn parse(text: &str) -> Result<Self, String> {
-        let given = match text.contains('/') {
-            true => InputName::parse(text).map(Self::Whole),
-            false => JobName::is_id(text).then(|| Self::Id(text.to_owned())),
+        let given = match job_view::own_id(text, "inputs") {
+            Some(id) => Some(Self::Id(id.to_owned())),
+            None => InputName::parse(text).map(Self::Whole),
         };
         given.ok_or_else(|| format!("{text:?} is not an input's name, as `scpsfm upload` prints it"))
     }
@@ -207,6 +206,20 @@ fn parse_seconds(text: &str) -> Result<Duration, String> {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn an_input_may_be_given_in_full_or_by_its_id() {
+        let of = |text: &str| {
+            let access = AccessArgs { tenant: Some("north".into()), ..AccessArgs::default() };
+            GivenInput::parse(text).map(|given| given.of(&access).expect("a tenant").to_string())
+        };
+        assert_eq!(of("a-1").as_deref(), Ok("tenants/north/inputs/a-1"));
+        assert_eq!(of("tenants/south/inputs/a-1").as_deref(), Ok("tenants/south/inputs/a-1"));
+        assert_eq!(of("tenants/-/inputs/a-1").as_deref(), Ok("tenants/north/inputs/a-1"), "as `delete` prints it");
+        for bad in ["", "A", "inputs/a", "tenants/-/jobs/a", "tenants/-/inputs/", "tenants/-/inputs/a/b"] {
+            assert!(of(bad).is_err(), "{bad}");
+        }
+    }
 
     #[test]
     fn a_label_that_is_given_twice_is_refused_by_its_key() {
