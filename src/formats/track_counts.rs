@@ -10,7 +10,8 @@ pub struct TrackCounts {
     pub inlier: usize,
     /// Consistent with the two registered views of a part that see them.
     pub two_view: usize,
-    /// Seen by too few registered views for a verdict. `None`: the input is not at hand, or there is no reconstruction.
+    /// Of AUTO and GEOMETRY: seen by too few registered views for a verdict; `None` where the input is not at hand. 0 for
+    /// other methods, which give every track a verdict. `None` where there is no reconstruction.
     pub unclassified: Option<usize>,
     /// All others. `None` where `unclassified` is.
     pub rejected: Option<usize>,
@@ -21,8 +22,8 @@ impl TrackCounts {
         let inlier = solution.inlier_track_count();
         let two_view = solution.two_view_tracks.len();
         let unclassified = unclassified(solution, input);
-        let judged = solution.tracks.inlier.len() - inlier;
-        let rejected = unclassified.map(|unclassified| judged.saturating_sub(two_view + unclassified));
+        let others = solution.tracks.inlier.len() - inlier;
+        let rejected = unclassified.map(|unclassified| others.saturating_sub(two_view + unclassified));
         Self { inlier, two_view, unclassified, rejected }
     }
 }
@@ -68,7 +69,9 @@ mod tests {
         assert_eq!(counts(&solution), few_views);
         // The networks weigh every track, whoever sees it.
         solution.method = Method::Paper;
-        assert_eq!(counts(&solution), TrackCounts { two_view: 1, rejected: Some(19), ..all });
+        let weighed = TrackCounts { two_view: 1, rejected: Some(19), ..all };
+        assert_eq!(counts(&solution), weighed);
+        assert_eq!(TrackCounts::new(&solution, None), weighed);
         solution.status = Status::NoReconstruction;
         assert_eq!(counts(&solution).rejected, None);
     }
