@@ -1,8 +1,8 @@
 //! Files in and out: tables of observations, OpenSfM's and COLMAP's files, and the result files, whose fields are a
 //! contract.
 //!
-//! May depend on `domain` and `geometry`, on `solver` for how many views verify a track, and on `report` for the page
-//! among the result files; knows nothing of transport.
+//! May depend on `domain` and `geometry`, and on `report` for the page among the result files; knows nothing of
+//! transport.
 
 pub mod bundler;
 pub mod cameras_json;

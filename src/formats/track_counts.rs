@@ -1,8 +1,7 @@
 //! How many tracks have which verdict.
 
 use super::LabelledInput;
-use crate::domain::{Method, Solution, Status};
-use crate::solver::VERIFIED;
+use crate::domain::{Method, Solution, Status, VERIFIED};
 
 /// How many tracks have which verdict; each track has one of the four.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]

@@ -28,7 +28,7 @@ pub use matches::{JoinedTracks, Joining, PairMatches, RawMatches};
 pub use progress::{
     HeadProgress, Losses, Observer, Phase, Progress, ReconstructionProgress, Silent, Stage, Step, Task,
 };
-pub use result::{Calibration, Grade, LensProjection, Proposal, Solution, Status};
+pub use result::{Calibration, Grade, LensProjection, Proposal, Solution, Status, VERIFIED};
 pub use settings::{Backend, Method, SolveSettings};
 pub use stop::{StopReason, StopToken};
 pub use warning::{Warning, WarningCode};

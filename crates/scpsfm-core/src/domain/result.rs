@@ -12,6 +12,9 @@ use super::second_structure::SecondStructure;
 use super::settings::Method;
 use super::warning::Warning;
 
+/// Observations from which on a track may be verified: two make a point, and one more verifies it.
+pub const VERIFIED: usize = 3;
+
 /// Whether a reconstruction stands.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "SCREAMING_SNAKE_CASE")]

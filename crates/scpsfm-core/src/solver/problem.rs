@@ -25,7 +25,7 @@ use crate::parallel::Threads;
 pub const LEAST_RETAINED_SHARE: f64 = 0.6;
 
 /// Observations that make a point and verify it: two and one.
-pub const VERIFIED: usize = 3;
+pub use crate::domain::VERIFIED;
 
 /// What every stage of one solve works on; observations keep the input's sorted order (track, view).
 pub struct Problem<'a> {
