@@ -72,19 +72,29 @@ pub fn parts(solution: &Solution) -> BTreeMap<u32, Vec<usize>> {
     parts
 }
 
-/// The points of all parts, each with its part and its weight: those of the tracks, then the further ones of tracks that
-/// join several.
-pub fn points(solution: &Solution) -> impl Iterator<Item = (u32, f32, [f64; 3])> {
+/// A point in a part.
+pub struct PlacedPoint {
+    pub part: u32,
+    pub weight: f32,
+    pub at: [f64; 3],
+    /// A further one of a track that joins several.
+    pub is_further: bool,
+}
+
+/// The points of all parts: those of the tracks, then the further ones of tracks that join several.
+pub fn points(solution: &Solution) -> impl Iterator<Item = PlacedPoint> {
     let tracks = &solution.tracks;
     let own = tracks
         .point
         .iter()
         .enumerate()
-        .map(|(track, point)| (track, tracks.weight.get(track).copied().unwrap_or(0.0), *point));
-    let further = solution.splits.iter().map(|split| (split.track as usize, split.weight, split.point));
+        .map(|(track, point)| (track, tracks.weight.get(track).copied().unwrap_or(0.0), *point, false));
+    let further = solution.splits.iter().map(|split| (split.track as usize, split.weight, split.point, true));
     own.chain(further)
-        .filter_map(|(track, weight, point)| Some((tracks.part_of(track)?, weight, point?)))
-        .filter(|(_, _, point)| point.iter().all(|value| value.is_finite()))
+        .filter_map(|(track, weight, point, is_further)| {
+            Some(PlacedPoint { part: tracks.part_of(track)?, weight, at: point?, is_further })
+        })
+        .filter(|point| point.at.iter().all(|value| value.is_finite()))
 }
 
 /// The views of each track's inlier observations, ascending, each once.
@@ -130,12 +140,16 @@ mod tests {
 
     #[test]
     fn a_track_that_joins_two_points_has_both() {
-        let (input, solution) = fixture::solved_with_a_split();
+        let (input, mut solution) = fixture::solved_with_a_split();
         assert_eq!(points(&solution).count(), solution.inlier_track_count() + 1);
+        assert_eq!(points(&solution).filter(|point| point.is_further).count(), 1);
         let page = crate::report::page(&solution, Some(&input));
         assert!(
             page.contains("20 of 20 points are drawn. 1 of the 20 are further points of tracks that join several.")
         );
+        solution.splits[0].point = Some([f64::NAN; 3]);
+        let page = crate::report::page(&solution, Some(&input));
+        assert!(page.contains("19 of 19 points are drawn.</p>"), "what is not among all is no further one");
     }
 
     #[test]

@@ -176,7 +176,7 @@ mod tests {
     fn forward_is_up_and_right_is_right() {
         let cameras = vec![camera(0.0, 0.0), camera(1.0, 0.0), camera(1.0, 2.0)];
         let points = vec![Point { at: Vector3::new(0.0, 0.0, 4.0), weight: 1.0 }];
-        let svg = svg(&Part { part: 7, cameras, points, all_points: 9 });
+        let svg = svg(&Part { part: 7, cameras, points, all_points: 9, further_points: 0 });
         assert!(svg.contains("Part 7 from above: 3 views, 9 points") && svg.contains("class=\"path p1\""), "{svg}");
         let path = svg.split("points=\"").nth(1).and_then(|rest| rest.split('"').next()).expect("a path");
         let at: Vec<Vec<f64>> =
@@ -189,7 +189,7 @@ mod tests {
         let mut cameras: Vec<Camera> = (0..5).map(|k| camera(0.1 * f64::from(k % 2), 0.0)).collect();
         cameras.iter_mut().enumerate().for_each(|(k, camera)| camera.centre.y = k as f64);
         let points = vec![Point { at: Vector3::new(0.0, 2.0, 4.0), weight: 1.0 }];
-        let svg = svg(&Part { part: 0, cameras, points, all_points: 1 });
+        let svg = svg(&Part { part: 0, cameras, points, all_points: 1, further_points: 0 });
         assert!(svg.contains("Part 0 from the side: 5 views"), "{svg}");
         let path = svg.split("points=\"").nth(1).and_then(|rest| rest.split('"').next()).expect("a path");
         let across: Vec<f64> = path.split(' ').filter_map(|pair| pair.split(',').next()?.parse().ok()).collect();
@@ -203,7 +203,7 @@ mod tests {
         let point = |(x, z): (f64, f64)| Point { at: Vector3::new(x, 0.0, z), weight: 1.0 };
         let points: Vec<Point> = near.chain(far).map(point).collect();
         let cameras = vec![camera(-1.0, 0.0), camera(1.0, 0.0)];
-        let svg = svg(&Part { part: 0, cameras, points, all_points: 100 });
+        let svg = svg(&Part { part: 0, cameras, points, all_points: 100, further_points: 0 });
         assert!(svg.contains("100 points (20 % outside)"), "{svg}");
         let places = svg.split('M').filter_map(|piece| piece.split_once("h2v2")?.0.split_once(' ')?.1.parse().ok());
         let places: Vec<f64> = places.collect();
@@ -213,7 +213,13 @@ mod tests {
 
     #[test]
     fn one_camera_and_no_point_make_a_drawing() {
-        let svg = svg(&Part { part: 0, cameras: vec![camera(0.0, 0.0)], points: Vec::new(), all_points: 0 });
+        let svg = svg(&Part {
+            part: 0,
+            cameras: vec![camera(0.0, 0.0)],
+            points: Vec::new(),
+            all_points: 0,
+            further_points: 0,
+        });
         assert!(!svg.contains("NaN") && !svg.contains("inf"), "{svg}");
     }
 }

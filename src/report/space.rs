@@ -41,13 +41,15 @@ pub struct Part {
     pub points: Vec<Point>,
     /// Points before they were thinned.
     pub all_points: usize,
+    /// Of these the further ones of tracks that join several.
+    pub further_points: usize,
 }
 
 /// The parts of a metric result; none without one.
 pub fn parts(solution: &Solution, input: Option<&LabelledInput>) -> Vec<Part> {
     let mut parts: Vec<Part> = counts::parts(solution)
         .keys()
-        .map(|&part| Part { part, cameras: Vec::new(), points: Vec::new(), all_points: 0 })
+        .map(|&part| Part { part, cameras: Vec::new(), points: Vec::new(), all_points: 0, further_points: 0 })
         .collect();
     let place = |parts: &[Part], part: u32| parts.binary_search_by_key(&part, |entry| entry.part).ok();
     for (index, camera) in CamerasJson::new(solution, input).views.iter().enumerate() {
@@ -73,13 +75,14 @@ pub fn parts(solution: &Solution, input: Option<&LabelledInput>) -> Vec<Part> {
 /// Every `k`-th point, of all parts together.
 fn add_points(parts: &mut [Part], solution: &Solution) {
     let place = |part: u32| parts.binary_search_by_key(&part, |entry| entry.part).ok();
-    let placed: Vec<(f32, usize, [f64; 3])> =
-        counts::points(solution).filter_map(|(part, weight, point)| Some((weight, place(part)?, point))).collect();
+    let placed: Vec<(usize, counts::PlacedPoint)> =
+        counts::points(solution).filter_map(|point| Some((place(point.part)?, point))).collect();
     let step = placed.len().div_ceil(MAX_POINTS).max(1);
-    for (index, (weight, part, point)) in placed.into_iter().enumerate() {
+    for (index, (part, point)) in placed.into_iter().enumerate() {
         parts[part].all_points += 1;
+        parts[part].further_points += usize::from(point.is_further);
         if index % step == 0 {
-            parts[part].points.push(Point { at: point.into(), weight: f64::from(weight).clamp(0.0, 1.0) });
+            parts[part].points.push(Point { at: point.at.into(), weight: f64::from(point.weight).clamp(0.0, 1.0) });
         }
     }
 }
@@ -151,7 +154,7 @@ pub fn section(solution: &Solution, input: Option<&LabelledInput>) -> String {
     let cameras: usize = parts.iter().map(|part| part.cameras.len()).sum();
     let shown: usize = parts.iter().map(|part| part.points.len()).sum();
     let all: usize = parts.iter().map(|part| part.all_points).sum();
-    let further = match solution.splits.iter().filter(|split| split.point.is_some()).count() {
+    let further = match parts.iter().map(|part| part.further_points).sum::<usize>() {
         0 => String::new(),
         count => format!(" {count} of the {all} are further points of tracks that join several."),
     };

@@ -39,7 +39,7 @@ pub fn parts(solution: &Solution, input: Option<&LabelledInput>, counts: &[ViewC
 
 fn part_table(solution: &Solution, input: Option<&LabelledInput>) -> String {
     let mut points = BTreeMap::<u32, usize>::new();
-    counts::points(solution).for_each(|(part, _, _)| *points.entry(part).or_default() += 1);
+    counts::points(solution).for_each(|point| *points.entry(point.part).or_default() += 1);
     let mut html = String::from(
         "<div class=\"table\"><table>\n<tr><th>part</th><th>views</th><th>from</th><th>to</th><th>points</th></tr>\n",
     );
