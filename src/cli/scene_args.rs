@@ -145,8 +145,8 @@ pub struct CameraArgs {
     #[arg(long, value_name = "K1", default_value_t = 0.0, allow_hyphen_values = true)]
     pub radial_k1: f64,
 
-    /// Focal length in pixels [default: random, 800 to 1600]
-    #[arg(long, value_name = "PX", value_parser = parse_positive)]
+    #[arg(long, value_name = "PX", value_parser = parse_positive,
+        help = format!("Focal length in pixels [default: random, {} to {}]", FOCAL_RANGE_PX.0, FOCAL_RANGE_PX.1))]
     pub focal_px: Option<f64>,
 
     /// The focal length of each view is random in f (1 +- SHARE)

@@ -50,7 +50,7 @@ options! {
         joined: f64 = 0.0,
         /// Radial distortion, as in [`SceneOptions::radial_k1`].
         radial_k1: f64 = 0.0,
-        /// Range of the focal length in pixels; of equal ends it is known.
+        /// Range of the focal length in pixels; equal ends fix it.
         focal_range_px: (f64, f64) = FOCAL_RANGE_PX,
         /// The focal length of each view is uniform in `f (1 +- zoom)`; 0: one focal length for all.
         #[serde(default)]

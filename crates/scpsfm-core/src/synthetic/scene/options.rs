@@ -48,7 +48,7 @@ options! {
         /// Largest roll: each camera is turned about its optical axis as well, uniform in `+-max_roll_rad`, whatever
         /// the motion.
         max_roll_rad: f64 = 0.0,
-        /// Range of the focal length in pixels; of equal ends it is known.
+        /// Range of the focal length in pixels; equal ends fix it.
         focal_range_px: (f64, f64) = FOCAL_RANGE_PX,
         /// Whether every view has a camera of its own, and is a camera group: a focal length in that range, a principal
         /// point up to .02 of the width off the common one along each axis, and a distortion within 5 % of the common
