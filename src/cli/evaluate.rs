@@ -328,6 +328,10 @@ mod tests {
     #[test]
     fn photographed_scenes_are_a_suite_of_their_own() {
         assert!(parse(&["--photographed", "--seeds", "3", "--scenes", "orbit", "--peer", "peer"]).is_ok());
+        for none in ["", ",", ",,"] {
+            let error = parse(&["--photographed", "--scenes", none]).err().unwrap_or_else(|| panic!("{none:?}"));
+            assert!(error.to_string().contains("names no scene"), "{error}");
+        }
         let others: [&[&str]; 5] =
             [&["--observations"], &["--quick"], &["--real", "sequences"], &["--priors"], &["--sweeps", "orbit"]];
         for more in others {

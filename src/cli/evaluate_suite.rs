@@ -22,8 +22,13 @@ use scpsfm_core::subspace;
 pub struct SceneFilter {
     /// The scenes of these names, or all whose names hold these texts, separated by commas; a comma before a space is
     /// part of a name. With --photographed, of the scenes of the first --seeds seeds [default: all]
-    #[arg(long, value_name = "TEXTS", requires = "suite", conflicts_with = "real")]
+    #[arg(long, value_name = "TEXTS", value_parser = naming, requires = "suite", conflicts_with = "real")]
     scenes: Option<String>,
+}
+
+/// Refuses what names no scene: an empty variable of a shell is not to start all of them.
+fn naming(texts: &str) -> Result<String, &'static str> {
+    if texts.split(',').all(str::is_empty) { Err("names no scene") } else { Ok(texts.to_owned()) }
 }
 
 impl SceneFilter {

@@ -206,10 +206,15 @@ impl SceneOptions {
     }
 }
 
+/// Focal lengths that lenses have before images 1,000 px wide: a tenth of the width and less is no perspective lens, a
+/// hundred widths a telescope.
+const FOCAL_LIMITS_PX: (f64, f64) = (100.0, 100_000.0);
+
 /// Refuses what is no range of focal lengths.
 pub(in crate::synthetic) fn check_focal_range((least, most): (f64, f64), found: &mut Violations) {
-    if !(least > 0.0 && least <= most && most.is_finite()) {
-        let reason = format!("{least} to {most} is not a range of positive numbers");
+    let (shortest, longest) = FOCAL_LIMITS_PX;
+    if !(least >= shortest && least <= most && most <= longest) {
+        let reason = format!("{least:e} to {most:e} px is not a range within {shortest}..={longest} px");
         found.push(Violation::of("focal_range_px", reason));
     }
 }
@@ -254,6 +259,8 @@ mod tests {
             ("zoom", SceneOptions { zoom: 1.0, ..default() }),
             ("focal_range_px", SceneOptions { focal_range_px: (500.0, 400.0), ..default() }),
             ("focal_range_px", SceneOptions { focal_range_px: (0.0, 0.0), ..default() }),
+            ("focal_range_px", SceneOptions { focal_range_px: (1e308, 1e308), ..default() }),
+            ("focal_range_px", SceneOptions { focal_range_px: (f64::NAN, 900.0), ..default() }),
         ];
         for (name, options) in cases {
             let error = options.validate().expect_err(name);
