@@ -39,8 +39,10 @@ pub(super) enum Upgrade {
     /// A camera that moved without turning, where its scene has depth: a focal length that is known otherwise makes it
     /// metric.
     Translation(Translating),
-    /// Nothing.
+    /// Nothing: the camera did not turn, or hardly moved.
     None,
+    /// Nothing: a plane and a rotation explain the views, and give them other focal lengths.
+    Undecided,
 }
 
 /// The observations that homographies explain, with the points that enough of them verify, where homographies with these
@@ -112,7 +114,7 @@ fn not_turning() -> Warning {
 fn undecided(detail: String, reason: &str) -> Critical {
     let warnings =
         vec![Warning::new(WarningCode::PlanarOrRotation, detail), Warning::new(WarningCode::UnobservableFocal, reason)];
-    Critical { warnings, upgrade: Upgrade::None }
+    Critical { warnings, upgrade: Upgrade::Undecided }
 }
 
 /// What the views show where homographies nearly explain them; otherwise the homographies, if there are any.

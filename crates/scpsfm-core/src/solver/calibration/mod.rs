@@ -180,9 +180,10 @@ pub fn calibrate(problem: &Uncalibrated, scale_px: f64, stop: &StopToken) -> Res
     let of_supported = supported.as_ref().map(|observations| Uncalibrated { observations, ..*all });
     let compared =
         of_supported.as_ref().map(|some| Compared::new(some, some, scale_px, stop, &mut || ())).transpose()?;
-    // What is not supported may be the scene, where all else stands still in the image.
+    // What is not supported may be the scene, where all else stands still in the image, and the depth of a camera that
+    // moves straight on.
     let (problem, compared) = match of_supported.as_ref().zip(compared) {
-        Some(found) if !found.1.shows_little_motion() => found,
+        Some(found) if !matches!(found.1.critical.upgrade, Upgrade::None) => found,
         _ => (all, Compared::new(all, all, scale_px, stop, &mut || ())?),
     };
     let Compared { cameras, points, mut fit, critical, mut warnings } = compared;
@@ -213,7 +214,7 @@ pub fn calibrate(problem: &Uncalibrated, scale_px: f64, stop: &StopToken) -> Res
         (Upgrade::Translation(translation), [Some(focal)]) => {
             search.known_focal(&translation, focal.focal_px / scale_px)
         }
-        (Upgrade::Translation(_) | Upgrade::None, _) => return Ok(problem.refused(&warnings)),
+        (Upgrade::Translation(_) | Upgrade::None | Upgrade::Undecided, _) => return Ok(problem.refused(&warnings)),
     };
     if minima.is_empty() {
         warnings.push(no_start());
@@ -352,9 +353,5 @@ impl Compared {
         Error::check(stop)?;
         heartbeat();
         Ok(Self { cameras, points, fit, critical, warnings })
-    }
-
-    fn shows_little_motion(&self) -> bool {
-        self.critical.warnings.iter().any(|warning| warning.code == WarningCode::LittleMotion)
     }
 }
