@@ -1,11 +1,10 @@
 //! A result in a few lines for people.
 
 use super::next_steps::{self, Files};
-use crate::domain::{Grade, Solution, Status};
+use crate::domain::{Grade, Solution, Status, VERIFIED};
 use crate::formats::result_json::{CameraGroupJson, SecondStructureCounts, camera_groups};
 use crate::formats::track_counts::TrackCounts;
 use crate::formats::{LabelledInput, result_files, second_structures, warnings};
-use crate::solver::VERIFIED;
 
 /// Cameras told one by one; a photo collection may have one an image, and result.json has them all.
 const MOST_CAMERAS: usize = 20;

@@ -85,7 +85,7 @@ impl ReferenceHomographies {
 
     /// Unknowns of homographies and their points, the gauge taken off.
     pub fn unknowns(&self) -> usize {
-        (8 * self.views.len() + 2 * self.observed()).saturating_sub(HOMOGRAPHIES_GAUGE)
+        unknowns_of_homographies(self.views.len(), self.observed())
     }
 
     fn observed(&self) -> usize {
@@ -160,8 +160,12 @@ pub fn fit_homographies(
     iterations: usize,
     stop: &StopToken,
 ) -> CriticalFit<Homographies> {
-    let unknowns = 8 * start.views.len() + 2 * observed;
-    adjusted(start, unknowns, HOMOGRAPHIES_GAUGE, iterations, observations, stop)
+    let unknowns = unknowns_of_homographies(start.views.len(), observed);
+    adjusted(start, unknowns, iterations, observations, stop)
+}
+
+fn unknowns_of_homographies(views: usize, points: usize) -> usize {
+    (8 * views + 2 * points).saturating_sub(HOMOGRAPHIES_GAUGE)
 }
 
 /// A camera that only turned, its principal point in the centre, from the focal length that explains the views best:
@@ -234,13 +238,12 @@ fn positions(observations: &[Observation], views: usize, points: usize, referenc
 fn adjusted<const C: usize, const P: usize, M: BundleProblem<C, P>>(
     mut model: M,
     unknowns: usize,
-    gauge: usize,
     iterations: usize,
     observations: &[Observation],
     stop: &StopToken,
 ) -> CriticalFit<M> {
     let report = minimise(&mut model, observations, &Options::squared(iterations), stop);
-    CriticalFit { model, cost: report.cost, unknowns: unknowns.saturating_sub(gauge) }
+    CriticalFit { model, cost: report.cost, unknowns }
 }
 
 /// Fits a camera that moves without turning.
@@ -274,7 +277,8 @@ pub fn fit_translation(
     let at_unit_depth = positions.into_iter().map(|position| position.unwrap_or_default().push(1.0));
     let mut model = Translating { translations: epipoles, points: at_unit_depth.collect() };
     alternate(&mut model, observations, reference);
-    Some(adjusted(model, 3 * views + 3 * observed, TRANSLATING_GAUGE, ITERATIONS, observations, stop))
+    let unknowns = (3 * (views + observed)).saturating_sub(TRANSLATING_GAUGE);
+    Some(adjusted(model, unknowns, ITERATIONS, observations, stop))
 }
 
 /// The common epipole of two views that are not turned to each other: it lies on the line through each point's images.

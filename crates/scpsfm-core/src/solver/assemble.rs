@@ -117,11 +117,12 @@ impl Assembled {
     /// Whether it is the result in place of another: where it is verified, has more tracks in most of its views or the
     /// other is of static ones, and is graded no worse. A calibration is of the camera, whatever moved before it.
     fn replaces(&self, other: &Self, problem: &Problem) -> bool {
-        let count = |one: &Self| second_structures::distinct_count(problem, &one.judged.tracks.inlier);
+        let [own, others] =
+            [self, other].map(|one| second_structures::distinct_count(problem, &one.judged.tracks.inlier));
         let [geometry, of_other] = [self, other].map(|one| &one.reconstruction.geometry);
         let views = second_structures::views_of_largest(geometry);
-        let has_more = count(self) > count(other) && second_structures::are_most(views, of_other);
-        count(self) >= LEAST_INLIERS
+        let has_more = own > others && second_structures::are_most(views, of_other);
+        own >= LEAST_INLIERS
             && (has_more || of_other.of_static)
             && !geometry.of_static
             && self.reconstruction.grade.is_no_worse_than(other.reconstruction.grade)

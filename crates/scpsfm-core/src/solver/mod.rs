@@ -50,7 +50,6 @@ use crate::domain::{Input, Observer, Sha256Digest, Solution, SolveSettings, Stop
 use crate::parallel::Threads;
 pub use memory::estimated_bytes;
 use problem::Problem;
-pub use problem::VERIFIED;
 use recorder::Recorder;
 use sequence::Ended;
 

@@ -3,6 +3,7 @@
 use nalgebra::{Matrix3, Vector3};
 
 use super::*;
+use crate::domain::VERIFIED;
 use crate::domain::second_structure::{SecondStructure, SecondStructureKind};
 use crate::evaluation::measures::{error_3d, rms_after_alignment};
 use crate::synthetic::photographed::WrongKind;
