@@ -210,6 +210,8 @@ pub async fn run(args: Args) -> Result<Exit, Failure> {
     }
     if args.photographed.photographed {
         let seeds = args.seeds.unwrap_or(evaluate_photographed::SEEDS);
+        let first = args.photographed.first_seed;
+        let seeds = first..first.saturating_add(seeds);
         return evaluate_photographed::run(&scenes, seeds, args.real.peer_words()?, &suite);
     }
     if args.long.long {
@@ -328,6 +330,8 @@ mod tests {
     #[test]
     fn photographed_scenes_are_a_suite_of_their_own() {
         assert!(parse(&["--photographed", "--seeds", "3", "--scenes", "orbit", "--peer", "peer"]).is_ok());
+        assert!(parse(&["--photographed", "--first-seed", "5"]).is_ok());
+        assert!(parse(&["--first-seed", "5"]).is_err(), "other suites have seeds of their own");
         for none in ["", ",", ",,"] {
             let error = parse(&["--photographed", "--scenes", none]).err().unwrap_or_else(|| panic!("{none:?}"));
             assert!(error.to_string().contains("names no scene"), "{error}");

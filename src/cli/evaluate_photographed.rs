@@ -1,5 +1,7 @@
 //! `scpsfm evaluate --photographed`: scenes as people photograph them.
 
+use std::ops::Range;
+
 use serde_json::json;
 
 use super::evaluate_suite::{SuiteRunner, chosen};
@@ -15,7 +17,7 @@ pub const SEEDS: u64 = 300;
 #[derive(Debug, Clone, clap::Args)]
 #[command(next_help_heading = "Photographed scenes")]
 pub struct PhotographedArgs {
-    /// Solve scenes as people photograph them instead of the sweeps, one for each of 300 seeds: ten motions, eight
+    /// Solve scenes as people photograph them instead of the sweeps, one for each seed: ten motions, eight
     /// lenses, constant, drifting and two focal lengths, tracks of some views, and nothing or 10 to 70 % wrong in eight
     /// kinds. Tables by each of these, beside the Cramer-Rao bound of the scenes. Writes photographed.json, and
     /// photographed.jsonl, with which it goes on where it was stopped. With --peer another program is run on the
@@ -24,15 +26,20 @@ pub struct PhotographedArgs {
     #[arg(long, groups = ["suite", "beside"],
         conflicts_with_all = ["quick", "sweeps", "beyond", "ablation", "depths", "methods", "paper_width"])]
     pub photographed: bool,
+    /// First of the --seeds seeds. Others than the default show whether a result holds on scenes that nobody looked at
+    #[arg(long, value_name = "SEED", default_value_t = photographed::FIRST_SEED, requires = "photographed")]
+    pub first_seed: u64,
 }
 
 /// Runs the command on the scenes whose names hold one of these texts.
 ///
 /// # Errors
 /// A text that no scene has in its name, as wrong usage; files that cannot be written, a defect of the solver.
-pub fn run(scenes: &[&str], seeds: u64, peer: Vec<String>, suite: &SuiteRunner) -> Result<Exit, Failure> {
+pub fn run(scenes: &[&str], seeds: Range<u64>, peer: Vec<String>, suite: &SuiteRunner) -> Result<Exit, Failure> {
+    let (first, count) = (seeds.start, seeds.end - seeds.start);
     let words = photographed::words();
-    let there_are = format!("those of the first {seeds} seeds (--seeds), whose names join with / {words}");
+    let there_are =
+        format!("those of {count} seeds (--seeds) from {first} on (--first-seed), whose names join with / {words}");
     let all = photographed::scenes(seeds);
     let plan = Plan { scenes: chosen(all, PhotographedOptions::name, scenes, Some(there_are))?, peer };
     suite.run(
@@ -43,8 +50,11 @@ pub fn run(scenes: &[&str], seeds: u64, peer: Vec<String>, suite: &SuiteRunner) 
         "photographed.json",
         |records, _| {
             let tables = plan.tables(records);
-            let json = json!({ "seeds": seeds, "scenes": plan.scenes.len(), "peer": plan.peer, "tables": tables });
-            Ok((json, table::text(&tables)))
+            let scenes = plan.scenes.len();
+            Ok((
+                json!({ "first_seed": first, "seeds": count, "scenes": scenes, "peer": plan.peer, "tables": tables }),
+                table::text(&tables),
+            ))
         },
     )
 }
@@ -57,10 +67,10 @@ mod tests {
     fn a_text_without_photographed_scenes_names_those_that_there_are() {
         let directory = tempfile::tempdir().expect("a temporary directory");
         let suite = SuiteRunner { out: directory.path(), threads: 1, quiet: true, json: false };
-        let failure = run(&["orbit", "zeppelin"], 50, Vec::new(), &suite).expect_err("no such scene");
+        let failure = run(&["orbit", "zeppelin"], 7..57, Vec::new(), &suite).expect_err("no such scene");
         assert_eq!(failure.exit, Exit::Usage);
         let known =
-            ["--scenes zeppelin", "first 50 seeds", "motion (orbit, walk-around", "action-camera", "wrong-link"];
+            ["--scenes zeppelin", "50 seeds", "from 7 on", "motion (orbit, walk-around", "action-camera", "wrong-link"];
         assert!(known.iter().all(|word| failure.message.contains(word)), "{failure}");
     }
 }

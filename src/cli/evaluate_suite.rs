@@ -21,7 +21,7 @@ use scpsfm_core::subspace;
 #[derive(Debug, Clone, clap::Args)]
 pub struct SceneFilter {
     /// The scenes of these names, or all whose names hold these texts, separated by commas; a comma before a space is
-    /// part of a name. With --photographed, of the scenes of the first --seeds seeds [default: all]
+    /// part of a name. With --photographed, of the scenes of the --seeds seeds [default: all]
     #[arg(long, value_name = "TEXTS", value_parser = naming, requires = "suite", conflicts_with = "real")]
     scenes: Option<String>,
 }

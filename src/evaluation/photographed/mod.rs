@@ -6,6 +6,8 @@ pub mod table;
 #[cfg(test)]
 mod tests;
 
+use std::ops::Range;
+
 use serde::Serialize;
 
 use crate::domain::Grade;
@@ -15,8 +17,8 @@ use crate::evaluation::summary::mean;
 use crate::synthetic::PhotographedOptions;
 use crate::synthetic::photographed::{FocalKind, LensKind, PhotographedMotion, VisibilityKind, WrongKind};
 
-/// First seed: above those of the other evaluations.
-const FIRST_SEED: u64 = 800_000;
+/// First seed where none is asked for: above those of the other evaluations.
+pub const FIRST_SEED: u64 = 800_000;
 /// Bound of the log focal length below which a scene carries a calibration: half of what METRIC allows, so that an
 /// estimator that is not the best can have it, too.
 const CARRIES: f64 = 0.01;
@@ -40,9 +42,9 @@ const AXES: [Axis; 6] = [
     ("visibility", |options| options.visibility.name()),
 ];
 
-/// The scenes of so many seeds.
-pub fn scenes(seeds: u64) -> Vec<PhotographedOptions> {
-    (FIRST_SEED..FIRST_SEED + seeds).map(PhotographedOptions::drawn).collect()
+/// The scene of each seed.
+pub fn scenes(seeds: Range<u64>) -> Vec<PhotographedOptions> {
+    seeds.map(PhotographedOptions::drawn).collect()
 }
 
 /// The words that names of scenes consist of, in their order.
