@@ -213,6 +213,12 @@ impl IntrinsicsPrior {
         self
     }
 
+    /// With a parameter known more precisely, its standard deviation smaller by this factor.
+    pub fn narrowed(mut self, parameter: Parameter, factor: f64) -> Self {
+        self.information[parameter as usize] *= factor.powi(2);
+        self
+    }
+
     /// Without what is known of one parameter.
     pub fn forgetting(mut self, parameter: Parameter) -> Self {
         self.information[parameter as usize] = 0.0;

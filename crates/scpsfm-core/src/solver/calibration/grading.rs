@@ -2,7 +2,7 @@
 
 use super::fit::Fit;
 use super::misfit::Comparison;
-use super::models::{Candidate, Choice};
+use super::models::{Candidate, Choice, Selection};
 use super::options::CalibrationOptions;
 use super::search::Minimum;
 use super::verdict::Verdict;
@@ -24,20 +24,21 @@ pub(super) fn grade(
     mut warnings: Vec<Warning>,
 ) -> Result<Vec<Outcome>, Error> {
     let CalibrationOptions { fit: fit_options, lenses, grades, .. } = choice.problem.options;
-    let (best, others) = chosen(choice, fit, minima, &mut warnings)?;
+    let (selection, others) = chosen(choice, fit, minima, &mut warnings)?;
+    let best = &selection.best;
     Error::check(choice.stop)?;
     let comparison = match &stretch {
-        None => Comparison::new(&best, fit, choice),
+        None => Comparison::new(best, fit, choice),
         Some(stretch) => {
             let choice = Choice { problem: &stretch.problem, ..*choice };
-            Comparison::new(&choice.on_stretch(&best, stretch.metric), fit, &choice).beside(&best.fit)
+            Comparison::new(&choice.on_stretch(best, stretch.metric), fit, &choice).beside(&best.fit)
         }
     };
-    let sigmas = choice.sigmas(&best, comparison.inflation);
+    let sigmas = choice.sigmas(&selection, comparison.inflation);
     let has_own_focals = best.minimum.reconstruction.has_own_focals();
-    let mut focals = view_focals::of(&best, &sigmas, lenses);
+    let mut focals = view_focals::of(best, &sigmas, lenses);
     let determined: Vec<bool> = focals.iter().map(|view| view_focals::is_determined(view, grades)).collect();
-    let rival = rival(choice.problem, &best, &others, |view| determined[view]);
+    let rival = rival(choice.problem, best, &others, |view| determined[view]);
     // Of cameras that were taken for one, the tracks that fit are those that projective cameras fit as badly: their
     // ratio is no misfit, and what they violate the calibration by is. Where it is that alone, views of one camera
     // differ by some tenths of a per cent too, behind a lens that the model does not quite have: only what the grade
@@ -59,7 +60,7 @@ pub(super) fn grade(
                 let of_focal = sigmas.of_group[group][Parameter::LogFocal as usize];
                 let mut sigma = of_focal.filter(|sigma| *sigma < grades.unobservable_above);
                 if let Some(focal_prior) = choice.problem.focal_priors[group] {
-                    weigh_prior(&mut verdict, &mut sigma, choice, &best, group, &comparison, focal_prior);
+                    weigh_prior(&mut verdict, &mut sigma, choice, best, group, &comparison, focal_prior);
                 }
                 verdict.judge_sigma(sigma);
                 (of_focal, sigma)
@@ -67,7 +68,7 @@ pub(super) fn grade(
         };
         if let Some((rival, shift)) = rival {
             let worst = if shift > grades.weak_up_to { Grade::ProjectiveOnly } else { Grade::Weak };
-            verdict.cap(worst, WarningCode::SecondMinimum, second_minimum(rival, &best, choice.scale_px));
+            verdict.cap(worst, WarningCode::SecondMinimum, second_minimum(rival, best, choice.scale_px));
         }
         verdict.judge_fit(&comparison, &best.model.name(), choice.scale_px);
         if verdict.is_misfit && has_own_focals {
@@ -85,7 +86,7 @@ pub(super) fn grade(
         }
         verdict.judge_cheirality(best.minimum.cheirality);
         if verdict.grade != Grade::ProjectiveOnly && !has_own_focals {
-            verdict.warnings.extend(principal_point(&best, group, comparison.inflation, choice));
+            verdict.warnings.extend(principal_point(best, group, comparison.inflation, choice));
         }
         let ratio = |sigma: Option<f64>| Some(sigma? / of_focal?).filter(|ratio| ratio.is_finite());
         Outcome {
@@ -102,7 +103,7 @@ pub(super) fn grade(
     };
     let mut outcomes: Vec<Outcome> = (0..choice.problem.groups()).map(grade_group).collect();
     focals.iter_mut().for_each(|view| view_focals::forget_undetermined(view, grades));
-    let mut metric = best.minimum.reconstruction;
+    let mut metric = selection.best.minimum.reconstruction;
     if let ([lens], Some(mean)) = (metric.intrinsics.as_mut_slice(), view_focals::mean(&focals)) {
         lens.focal = mean;
     }
@@ -119,21 +120,23 @@ fn chosen(
     fit: &Fit,
     mut minima: Vec<Minimum>,
     warnings: &mut Vec<Warning>,
-) -> Result<(Candidate, Vec<Minimum>), Error> {
+) -> Result<(Selection, Vec<Minimum>), Error> {
     let problem = choice.problem;
     let first = minima.remove(best_in_front(&minima, problem, fit));
     let simplest = IntrinsicsModel::focal(first.reconstruction.has_own_focals());
     let mut of_model = Vec::new();
-    let mut best = choice.richest(Candidate::new(first, simplest, choice.priors(fit.noise), problem), &mut of_model)?;
-    let fisheye = choice.behind_fisheyes(&best, &mut minima)?;
-    let is_simplest = fisheye.is_none() && best.model == simplest;
+    let simple = Candidate::new(first, simplest, choice.priors(fit.noise), problem);
+    let mut found = choice.richest(simple, &mut of_model)?;
+    let fisheye = choice.behind_fisheyes(&found.best, &mut minima)?;
+    let is_simplest = fisheye.is_none() && found.best.model == simplest;
     if let Some(fisheye) = fisheye {
-        (best, of_model) = fisheye;
+        (found, of_model) = fisheye;
     }
     warnings.extend(of_model);
     if is_simplest {
-        return Ok((best, minima));
+        return Ok((found, minima));
     }
+    let Selection { best, tried } = &mut found;
     let least_in_front = problem.options.grades.least_in_front;
     let mut others = Vec::with_capacity(minima.len());
     for start in minima {
@@ -145,11 +148,12 @@ fn chosen(
         // A model that is wrong may rank the minima wrongly.
         if minimum.cost < best.minimum.cost && minimum.cheirality >= least_in_front.min(best.minimum.cheirality) {
             let better = Candidate::new(minimum.clone(), best.model, best.priors.clone(), problem);
-            minimum = std::mem::replace(&mut best, better).minimum;
+            minimum = std::mem::replace(best, better).minimum;
+            tried.clear();
         }
         others.push(minimum);
     }
-    Ok((best, others))
+    Ok((found, others))
 }
 
 /// The cheapest minimum whose points are in front of the cameras, if the data do not tell it from the cheapest.

@@ -53,10 +53,43 @@ impl Candidate {
         (0..self.priors.len()).filter_map(|group| self.sigma_of_focal(group)).reduce(f64::max)
     }
 
+    /// Value of a parameter of a group, of the log focal length in the mean where views have their own.
+    fn value(&self, group: usize, parameter: Parameter) -> f64 {
+        let reconstruction = &self.minimum.reconstruction;
+        match parameter {
+            Parameter::LogFocal if reconstruction.has_own_focals() => self.minimum.log_focal(),
+            _ => reconstruction.intrinsics[group].value(parameter),
+        }
+    }
+
+    /// Variance, for observations with unit variance, and value of the log focal length of each view that has its own
+    /// at the minimum of a model.
+    fn own_focals(&self, optimum: &Optimum) -> Vec<(Option<f64>, f64)> {
+        let Some(information) = &self.information else { return Vec::new() };
+        let focals = self.minimum.reconstruction.focals.iter();
+        let of_views = information.own_focals(optimum).into_iter().zip(focals);
+        of_views.map(|((variance, shift), focal)| (variance, focal.ln() + shift)).collect()
+    }
+
     /// The same of one group.
     fn sigma_of_focal(&self, group: usize) -> Option<f64> {
         self.sigma(group, Parameter::LogFocal, self.model, &self.priors)
     }
+}
+
+/// The model that was chosen, and what else was adjusted on the way.
+pub(super) struct Selection {
+    pub best: Candidate,
+    /// Simpler models, and richer ones that were not taken, of the same minimum.
+    pub tried: Vec<Candidate>,
+}
+
+/// A model as the observations and what lenses are like weigh it.
+struct Weighed<'a> {
+    log_weight: f64,
+    /// What it was linearised at.
+    from: &'a Candidate,
+    optimum: Optimum,
 }
 
 /// Standard deviations, the doubt about the model included.
@@ -126,20 +159,22 @@ impl Choice<'_> {
 
     /// Frees extension after extension, the most significant first, as long as the data ask for one and still determine
     /// the focal length.
-    pub fn richest(&self, simple: Candidate, warnings: &mut Vec<Warning>) -> Result<Candidate, Error> {
-        let mut best = simple;
+    pub fn richest(&self, simple: Candidate, warnings: &mut Vec<Warning>) -> Result<Selection, Error> {
+        let mut found = Selection { best: simple, tried: Vec::new() };
         loop {
             let mut taken = None;
-            for (extension, _) in self.promising(&best) {
+            for (extension, _) in self.promising(&found.best) {
                 Error::check(self.stop)?;
-                taken = self.extended(&best, extension, warnings);
-                if taken.is_some() {
+                let richer = self.adjusted(&found.best.minimum, found.best.model.with(extension), found.best.fit.noise);
+                if self.is_taken(&found.best, &richer, extension, warnings) {
+                    taken = Some(richer);
                     break;
                 }
+                found.tried.push(richer);
             }
             match taken {
-                Some(richer) => best = richer,
-                None => return Ok(best),
+                Some(richer) => found.tried.push(std::mem::replace(&mut found.best, richer)),
+                None => return Ok(found),
             }
         }
     }
@@ -153,7 +188,7 @@ impl Choice<'_> {
         &self,
         best: &Candidate,
         minima: &mut [Minimum],
-    ) -> Result<Option<(Candidate, Vec<Warning>)>, Error> {
+    ) -> Result<Option<(Selection, Vec<Warning>)>, Error> {
         let radii = self.wide_barrels(&best.minimum.reconstruction);
         if radii.iter().all(Option::is_none) {
             return Ok(None);
@@ -163,8 +198,8 @@ impl Choice<'_> {
         let mut warnings = Vec::new();
         let found = self.richest(self.adjusted(&from, simplest, best.fit.noise), &mut warnings)?;
         let parameters = |candidate: &Candidate| candidate.model.parameters().len() as f64;
-        let added = 1.0 + (parameters(&found) - parameters(best)) * self.problem.groups() as f64;
-        let gain = (best.fit.cost - found.fit.cost) / best.fit.noise.min(found.fit.noise).powi(2);
+        let added = 1.0 + (parameters(&found.best) - parameters(best)) * self.problem.groups() as f64;
+        let gain = (best.fit.cost - found.best.fit.cost) / best.fit.noise.min(found.best.fit.noise).powi(2);
         if gain <= added * self.problem.options.models.significant_gain_of_one {
             return Ok(None);
         }
@@ -209,15 +244,21 @@ impl Choice<'_> {
         found
     }
 
-    /// The candidate with this extension, if that is significant and leaves the focal length observable.
-    fn extended(&self, best: &Candidate, extension: Extension, warnings: &mut Vec<Warning>) -> Option<Candidate> {
-        let model = best.model.with(extension);
-        let richer = self.adjusted(&best.minimum, model, best.fit.noise);
+    /// Whether an extension is significant and leaves the focal length observable.
+    ///
+    /// * `richer`: the best candidate with it
+    fn is_taken(
+        &self,
+        best: &Candidate,
+        richer: &Candidate,
+        extension: Extension,
+        warnings: &mut Vec<Warning>,
+    ) -> bool {
         // What the simpler model costs with the same prior.
-        let simple = best.fit.cost + best.optimum(best.model, &richer.priors)?.delta_cost;
-        let gain = (simple - richer.minimum.cost) / richer.fit.noise.powi(2);
+        let Some(simple) = best.optimum(best.model, &richer.priors) else { return false };
+        let gain = (best.fit.cost + simple.delta_cost - richer.minimum.cost) / richer.fit.noise.powi(2);
         if gain <= self.significant_gain(extension) {
-            return None;
+            return false;
         }
         let CalibrationOptions { models, grades: GradeOptions { metric_below, .. }, .. } = self.problem.options;
         let observable = |group: usize| match (best.sigma_of_focal(group), richer.sigma_of_focal(group)) {
@@ -227,13 +268,13 @@ impl Choice<'_> {
             (None, rich) => rich.is_some() || self.problem.groups() > 1,
         };
         if (0..self.problem.groups()).all(observable) {
-            return Some(richer);
+            return true;
         }
         let shift = (richer.minimum.log_focal() - best.minimum.log_focal()).abs();
         if let Some(sigma) = best.sigma_log_focal().filter(|sigma| shift > models.model_shift * sigma) {
-            warnings.push(self.not_taken(best, &richer, extension, shift / sigma));
+            warnings.push(self.not_taken(best, richer, extension, shift / sigma));
         }
-        None
+        false
     }
 
     fn not_taken(&self, best: &Candidate, richer: &Candidate, extension: Extension, deviations: f64) -> Warning {
@@ -252,39 +293,32 @@ impl Choice<'_> {
     ///
     /// Bayesian model averaging (Hoeting, Madigan, Raftery & Volinsky 1999, eq. 3) over all combinations of extensions:
     /// the expected squared error of the value reported, `sum_k w_k (sigma_k^2 + (f_k - f)^2)`, with the weights from
-    /// Laplace's approximation of each model's evidence under [`LensOptions`](super::options::LensOptions). An
-    /// extension that the data can neither confirm nor refute thus costs what it would move.
+    /// Laplace's approximation of each model's evidence under [`LensOptions`](super::options::LensOptions), a model
+    /// with distortion once for each kind of lens. An extension that the data can neither confirm nor refute thus costs
+    /// what it would move.
     ///
     /// * `inflation`: factor on all of them, for what the calibration does not fit
-    pub fn sigmas(&self, best: &Candidate, inflation: f64) -> Sigmas {
-        let own = best.sigma_log_focal();
+    pub fn sigmas(&self, selection: &Selection, inflation: f64) -> Sigmas {
+        let best = &selection.best;
         let views = best.minimum.reconstruction.focals.len();
-        let (Some(own), Some(information), Some(here)) =
-            (own, &best.information, best.optimum(best.model, &best.priors))
-        else {
+        let own = best.sigma_log_focal().and_then(|own| Some((own, best.optimum(best.model, &best.priors)?)));
+        let Some((own, here)) = own else {
             let of_group = vec![[None; Parameter::COUNT]; self.problem.groups()];
             return Sigmas { of_group, view_focals: vec![None; views] };
         };
         let profiled = self.profiled(own, best);
         let unit = best.fit.noise.powi(2);
-        let models: Vec<(f64, Optimum)> = best
-            .model
-            .with_any_extensions()
-            .filter_map(|model| {
-                let there = best.optimum(model, &best.priors)?;
-                Some((self.log_weight(best, model, &here, &there), there))
-            })
-            .collect();
-        let highest = models.iter().map(|(weight, _)| *weight).fold(f64::NEG_INFINITY, f64::max);
-        let total: f64 = models.iter().map(|(weight, _)| (weight - highest).exp()).sum();
-        // Of what has this variance and shift under each model, and this shift under the best.
-        let averaged = |of_models: &dyn Fn(usize) -> (Option<f64>, f64), here: f64| {
+        let models: Vec<Weighed> =
+            best.model.with_any_extensions().flat_map(|model| self.weighed(selection, model)).collect();
+        let highest = models.iter().map(|model| model.log_weight).fold(f64::NEG_INFINITY, f64::max);
+        let weights: Vec<f64> = models.iter().map(|model| (model.log_weight - highest).exp()).collect();
+        let total: f64 = weights.iter().sum();
+        // Of what has this variance and value under each model, and this value under the best.
+        let averaged = |of_models: &mut dyn Iterator<Item = (Option<f64>, f64)>, here: f64| {
             let mut squared = 0.0;
-            for (k, (weight, _)) in models.iter().enumerate() {
-                let weight = (weight - highest).exp() / total;
-                let (variance, shift) = of_models(k);
+            for (weight, (variance, value)) in weights.iter().map(|weight| weight / total).zip(of_models) {
                 match variance {
-                    Some(variance) => squared += weight * (variance * unit + (shift - here).powi(2)),
+                    Some(variance) => squared += weight * (variance * unit + (value - here).powi(2)),
                     None if weight > self.problem.options.models.negligible => return None,
                     None => {}
                 }
@@ -295,33 +329,57 @@ impl Choice<'_> {
         let free = best.model.parameters();
         let of_parameter = |group: usize, parameter: Parameter| {
             let is_free = free.contains(&parameter) || (views > 0 && parameter == Parameter::LogFocal);
-            let of_models =
-                |k: usize| (models[k].1.variance_of(group, parameter), models[k].1.shift_of(group, parameter));
-            averaged(&of_models, here.shift_of(group, parameter)).filter(|_| is_free)
+            let value =
+                |from: &Candidate, optimum: &Optimum| from.value(group, parameter) + optimum.shift_of(group, parameter);
+            let mut of_models = models
+                .iter()
+                .map(|Weighed { from, optimum, .. }| (optimum.variance_of(group, parameter), value(from, optimum)));
+            averaged(&mut of_models, value(best, &here)).filter(|_| is_free)
         };
         let groups = 0..self.problem.groups();
         let of_group = groups.map(|group| Parameter::ALL.map(|parameter| of_parameter(group, parameter))).collect();
-        let here = information.own_focals(&here);
-        let there: Vec<_> = models.iter().map(|(_, there)| information.own_focals(there)).collect();
-        let of_view = |view: usize| averaged(&|k| there[k][view], here[view].1);
+        let here = best.own_focals(&here);
+        let there: Vec<_> = models.iter().map(|model| model.from.own_focals(&model.optimum)).collect();
+        let of_view = |view: usize| averaged(&mut there.iter().map(|of_views| of_views[view]), here[view].1);
         Sigmas { of_group, view_focals: (0..views).map(of_view).collect() }
     }
 
-    /// Logarithm of prior probability times evidence, up to what all models share.
-    fn log_weight(&self, best: &Candidate, model: IntrinsicsModel, here: &Optimum, there: &Optimum) -> f64 {
+    /// A model for each kind of lens that it may be of, from the candidate that was adjusted with most nearly the same
+    /// extensions: where the observations are weak, a linearisation foretells half of what an adjustment finds.
+    fn weighed<'c>(&self, selection: &'c Selection, model: IntrinsicsModel) -> Vec<Weighed<'c>> {
+        let Selection { best, tried } = selection;
+        let differing = |candidate: &Candidate| {
+            let extensions = Extension::ALL.into_iter();
+            extensions.filter(|one| candidate.model.contains(*one) != model.contains(*one)).count()
+        };
+        let adjusted = std::iter::once(best).chain(tried.iter().rev().filter(|tried| tried.information.is_some()));
+        let Some(from) = adjusted.min_by_key(|candidate| differing(candidate)) else { return Vec::new() };
+        let of_kind = |(share, precision): (f64, f64)| {
+            let narrowed = |prior: &IntrinsicsPrior| prior.narrowed(Parameter::RadialK1, precision);
+            let priors: Vec<IntrinsicsPrior> = best.priors.iter().map(narrowed).collect();
+            let optimum = from.optimum(model, &priors)?;
+            let gain = (best.fit.cost - from.fit.cost - optimum.delta_cost) / best.fit.noise.powi(2);
+            let log_weight = share.ln() + self.log_prior(model, &priors) + 0.5 * gain - 0.5 * optimum.log_determinant;
+            Some(Weighed { log_weight, from, optimum })
+        };
+        self.problem.options.lenses.kinds(model).into_iter().filter_map(of_kind).collect()
+    }
+
+    /// Logarithm of the prior probability of a model and of the density of its parameters where they are most likely,
+    /// up to what all models share.
+    fn log_prior(&self, model: IntrinsicsModel, priors: &[IntrinsicsPrior]) -> f64 {
         let lenses = &self.problem.options.lenses;
         let of = |extension: Extension| match model.contains(extension) {
             true => {
                 let of_group = |prior: &IntrinsicsPrior| -> f64 {
                     extension.parameters().iter().map(|parameter| prior.information[*parameter as usize].ln()).sum()
                 };
-                lenses.probability(extension).ln() + 0.5 * best.priors.iter().map(of_group).sum::<f64>()
+                lenses.probability(extension).ln() + 0.5 * priors.iter().map(of_group).sum::<f64>()
             }
             false if model.admits(extension) => (1.0 - lenses.probability(extension)).ln(),
             false => 0.0,
         };
-        let prior: f64 = Extension::ALL.into_iter().map(of).sum();
-        prior - 0.5 * (there.delta_cost - here.delta_cost) / best.fit.noise.powi(2) - 0.5 * there.log_determinant
+        Extension::ALL.into_iter().map(of).sum()
     }
 
     /// The standard deviation as the profile of the cost shows it, where that is larger than the linearised one.
