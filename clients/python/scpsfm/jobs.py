@@ -9,10 +9,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from ._fields import plain
+from ._result_parts import Grade, ResultStatus, grade_of
 from ._stubs import job_pb2, progress_pb2, result_pb2, settings_pb2
+from ._wire import Word, member, optional, seconds, word
 from .errors import InvalidArgument, Violation
-from .result import Grade, ResultStatus, _grade, _member, _Word, optional, seconds, word
-from .tracks import _plain
 
 __all__ = [
     "Capabilities",
@@ -28,7 +29,7 @@ __all__ = [
 ]
 
 
-class JobState(_Word):
+class JobState(Word):
     """Where a job stands."""
 
     UNSPECIFIED = "UNSPECIFIED"
@@ -45,7 +46,7 @@ class JobState(_Word):
         return self not in (JobState.UNSPECIFIED, JobState.QUEUED, JobState.RUNNING)
 
 
-class WebhookState(_Word):
+class WebhookState(Word):
     """How far the delivery of a webhook has come."""
 
     UNSPECIFIED = "UNSPECIFIED"
@@ -56,7 +57,7 @@ class WebhookState(_Word):
 
 def state_of(number: int) -> JobState:
     """The state of this number."""
-    state: JobState = _member(JobState, job_pb2.JobState, number, "JOB_STATE_")
+    state: JobState = member(JobState, job_pb2.JobState, number, "JOB_STATE_")
     return state
 
 
@@ -102,7 +103,7 @@ class Settings:
         """
         message = settings_pb2.SolveSettings()
         for field in fields(self):
-            value = _plain(getattr(self, field.name))
+            value = plain(getattr(self, field.name))
             if value is None:
                 continue
             if field.name in ("method", "backend"):
@@ -206,8 +207,8 @@ class JobSummary:
     def of(cls, message: job_pb2.JobSummary) -> JobSummary:
         """From the message of the API."""
         return cls(
-            status=_member(ResultStatus, result_pb2.ResultStatus, message.status, "RESULT_STATUS_"),
-            grade=_grade(message.grade),
+            status=member(ResultStatus, result_pb2.ResultStatus, message.status, "RESULT_STATUS_"),
+            grade=grade_of(message.grade),
             focal_px=optional(message, "focal_px"),
             sigma_log_focal=optional(message, "sigma_log_focal"),
             inlier_track_count=message.inlier_track_count,
@@ -290,7 +291,7 @@ class Webhook:
         """From the message of the API."""
         return cls(
             url=message.url,
-            state=_member(WebhookState, job_pb2.WebhookState, message.state, "WEBHOOK_STATE_"),
+            state=member(WebhookState, job_pb2.WebhookState, message.state, "WEBHOOK_STATE_"),
             attempt_count=message.attempt_count,
             last_error=message.last_error,
         )

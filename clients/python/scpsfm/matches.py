@@ -11,20 +11,12 @@ from typing import Any, ClassVar
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from ._fields import MAX_INDEX, invalid
 from ._stubs import input_pb2, result_pb2
+from ._track_arrays import MAX_POSITION_PX
+from ._views import FocalPrior, View, alike, append_views, plain_views, view_problems
 from .errors import InternalError, InvalidArgument
-from .tracks import (
-    MAX_INDEX,
-    MAX_POSITION_PX,
-    FocalPrior,
-    Tracks,
-    View,
-    _alike,
-    _append_views,
-    _invalid,
-    _plain_views,
-    _view_problems,
-)
+from .tracks import Tracks
 
 __all__ = ["Matches"]
 
@@ -81,7 +73,7 @@ class Matches:
         """
         self.keypoints = tuple(_positions(f"keypoints[{view}]", given) for view, given in enumerate(keypoints))
         if views is None:
-            views = _alike(self._FIELD, len(self.keypoints), width, height, names, camera_groups, focal_prior)
+            views = alike(self._FIELD, len(self.keypoints), width, height, names, camera_groups, focal_prior)
         elif any(given is not None for given in (width, height, names, camera_groups, focal_prior)):
             raise _wrong("views", "give either views, or width, height, names, camera_groups and focal_prior")
         self.views = tuple(views)
@@ -89,10 +81,10 @@ class Matches:
             raise _wrong("views", f"has {len(self.views)} entries, there are keypoints of {len(self.keypoints)} views")
         if len(self.views) < 2:
             raise _wrong("views", f"{len(self.views)} views; at least 2 are needed")
-        problems = list(_view_problems(self.views))
+        problems = list(view_problems(self.views))
         if problems:
-            raise _invalid(problems, field=self._FIELD)
-        self.views = _plain_views(self.views)
+            raise invalid(problems, field=self._FIELD)
+        self.views = plain_views(self.views)
         self.pairs = {}
         for pair, given in pairs.items():
             first, second = self._pair(pair)
@@ -143,7 +135,7 @@ class Matches:
     def _head(self) -> input_pb2.MatchSet:
         """The message without the arrays of keypoints and matches."""
         head = input_pb2.MatchSet(keypoint_counts=[len(of_view) for of_view in self.keypoints])
-        _append_views(head, self.views)
+        append_views(head, self.views)
         return head
 
     def _rows(self) -> dict[str, NDArray[Any]]:
@@ -203,7 +195,7 @@ class Matches:
 
 
 def _wrong(field: str, what: str) -> InvalidArgument:
-    return _invalid([(field, what)], field=Matches._FIELD)
+    return invalid([(field, what)], field=Matches._FIELD)
 
 
 def _two_columns(field: str, values: ArrayLike) -> NDArray[Any]:

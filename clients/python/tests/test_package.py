@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import ast
 import dataclasses
+import graphlib
 import inspect
 import subprocess
 import sys
@@ -61,6 +63,30 @@ def test_everything_that_is_named_is_there() -> None:
         assert name in scpsfm.__all__
     for name in set(scpsfm.errors.__all__) - {"Violation"}:
         assert issubclass(getattr(scpsfm, name), scpsfm.ScpsfmError)
+
+
+def module_name(path: Path) -> str:
+    return ".".join(path.relative_to(HERE).with_suffix("").parts).removesuffix(".__init__")
+
+
+def imported(path: Path, modules: set[str]) -> set[str]:
+    """The modules of the package that a file names after `import`, wherever in it that stands."""
+    parents = path.relative_to(HERE).parent.parts
+    found = set()
+    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+        if isinstance(node, ast.ImportFrom) and node.level:
+            base = [*parents[: len(parents) - node.level + 1], *([node.module] if node.module else [])]
+            names = {".".join([*base, alias.name]) for alias in node.names}
+            found |= names & modules or {".".join(base)}
+    return found
+
+
+def test_no_modules_import_each_other() -> None:
+    paths = [path for path in (HERE / "scpsfm").rglob("*.py") if "_stubs" not in path.parts]
+    modules = {module_name(path) for path in paths}
+    graph = {module_name(path): imported(path, modules) & modules for path in paths}
+    assert len(graph) > 20 and graph["scpsfm.result"] >= {"scpsfm.tracks", "scpsfm.exports"}
+    graphlib.TopologicalSorter(graph).prepare()
 
 
 def test_wheel_and_sdist_have_stubs_and_types_and_the_wheel_works(tmp_path: Path) -> None:

@@ -12,7 +12,9 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from ..tracks import MAX_INDEX, MAX_SIDE_PX, FocalPrior, Tracks, View
+from .._fields import MAX_INDEX
+from .._track_arrays import Made
+from .._views import MAX_SIDE_PX, FocalPrior, View
 from .problems import dense, of_file
 
 __all__ = ["FIRST_PIXEL", "MODELS", "Camera", "Images", "Model"]
@@ -134,7 +136,7 @@ class Images:
 
     def tracks(
         self,
-        kind: type[Tracks],
+        kind: type[Made],
         path: Path,
         image: NDArray[np.int64],
         track: NDArray[np.uint64],
@@ -142,7 +144,7 @@ class Images:
         keypoint: NDArray[np.int64],
         lines: NDArray[np.int64] | None,
         notes: list[str],
-    ) -> Tracks:
+    ) -> Made:
         """The tracks of observations; views are all images, in the order of their names.
 
         A track's second observation in an image is left out.

@@ -13,7 +13,8 @@ from urllib.parse import quote as url_quote
 import numpy as np
 from numpy.typing import NDArray
 
-from ..tracks import MAX_INDEX, Tracks
+from .._fields import MAX_INDEX
+from .._track_arrays import Made
 from .colmap import MODELS, Camera, Images
 from .join import join
 from .problems import of_file
@@ -27,7 +28,7 @@ _TABLES = {"verified": "two_view_geometries", "raw": "matches"}
 _BY_ID = {model.id: model for model in MODELS}
 
 
-def read_database(kind: type[Tracks], path: Path, matches: str | None, sigma_log: float) -> Tracks:
+def read_database(kind: type[Made], path: Path, matches: str | None, sigma_log: float) -> Made:
     """Reads a database, see `Tracks.from_colmap_database`."""
     if matches is not None and matches not in _TABLES:
         raise of_file(path, f"{matches!r} is neither 'verified' nor 'raw'", field="matches")
@@ -50,9 +51,7 @@ def read_database(kind: type[Tracks], path: Path, matches: str | None, sigma_log
         raise of_file(path, f"cannot be read as a COLMAP database: {error}") from None
 
 
-def _read(
-    connection: sqlite3.Connection, kind: type[Tracks], path: Path, matches: str | None, sigma_log: float
-) -> Tracks:
+def _read(connection: sqlite3.Connection, kind: type[Made], path: Path, matches: str | None, sigma_log: float) -> Made:
     query = "SELECT name FROM sqlite_master WHERE type = 'table' AND sql NOT LIKE 'CREATE VIRTUAL%'"
     tables = {name for (name,) in connection.execute(query)}
     for table in ("cameras", "images", "keypoints"):

@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from .._track_arrays import Made
 from ..errors import InvalidArgument
-from ..tracks import Tracks
 from .colmap import MODELS, Camera, Images
 from .problems import number, of_file, quote, whole
 
@@ -54,7 +54,7 @@ def model_kind(folder: Path) -> str | None:
     return None
 
 
-def read_model(kind: type[Tracks], folder: Path) -> Tracks:
+def read_model(kind: type[Made], folder: Path) -> Made:
     """Reads a model, see `Tracks.from_colmap_model`."""
     extension = model_kind(folder)
     if extension is None:

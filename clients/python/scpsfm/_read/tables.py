@@ -12,7 +12,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..tracks import MAX_SIDE_PX, FocalPrior, Label, Tracks, View
+from .._track_arrays import Made
+from .._views import MAX_SIDE_PX, FocalPrior, Label, View
 from .problems import Problems, dense, number, of_file, quote, whole
 
 __all__ = ["frame", "read_csv", "read_opensfm"]
@@ -54,12 +55,12 @@ def _unquote(field: str) -> str:
 
 
 def read_csv(
-    kind: type[Tracks],
+    kind: type[Made],
     path: Path,
     size: tuple[int, int] | None,
     names: Mapping[int, str] | None,
     focal_prior: FocalPrior | None,
-) -> Tracks:
+) -> Made:
     """Reads a table of observations, see `Tracks.from_csv`."""
     with path.open("rb") as file:
         if file.read(len(_SQLITE)) == _SQLITE:
@@ -148,14 +149,14 @@ def _quick(path: Path, header: list[str], line: int) -> dict[str, NDArray[Any]] 
 
 
 def _labelled(
-    kind: type[Tracks],
+    kind: type[Made],
     path: Path,
     columns: dict[str, NDArray[Any]],
     lines: NDArray[np.int64],
     size: tuple[int, int] | None,
     names: Mapping[int, str] | None,
     focal_prior: FocalPrior | None,
-) -> Tracks:
+) -> Made:
     """The tracks of a table, views and tracks in the ascending order of their numbers."""
     view_labels, view_index = np.unique(columns["view"], return_inverse=True)
     track_labels, track_index = np.unique(columns["track"], return_inverse=True)
@@ -221,7 +222,7 @@ class _Shot:
     focal_ratio: float
 
 
-def read_opensfm(kind: type[Tracks], path: Path, size: tuple[int, int] | None, focal_sigma_log: float | None) -> Tracks:
+def read_opensfm(kind: type[Made], path: Path, size: tuple[int, int] | None, focal_sigma_log: float | None) -> Made:
     """Reads OpenSfM's tracks.csv, see `Tracks.from_opensfm`."""
     if path.is_dir():
         path = path / "tracks.csv"

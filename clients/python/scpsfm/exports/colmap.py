@@ -18,7 +18,8 @@ from numpy.typing import NDArray
 
 from .._read.colmap import FIRST_PIXEL, MODELS
 from .._read.colmap_database import MAX_IMAGES
-from ..result import Calibration, Result
+from .._result_data import ResultData
+from .._result_parts import Calibration
 from ..tracks import FocalPrior, Tracks
 from .model import check, points_of_observations, quaternion, sizes
 
@@ -51,7 +52,7 @@ CREATE TABLE two_view_geometries (
 Pairs = list[tuple[int, int, NDArray[np.uint32]]]
 
 
-def to_colmap_database(tracks: Tracks, path: str | PathLike[str], result: Result | None = None) -> None:
+def to_colmap_database(tracks: Tracks, path: str | PathLike[str], result: ResultData | None = None) -> None:
     """Writes tracks as a COLMAP database: cameras, images, keypoints, matches and verified matches.
 
     Keypoints are the observations of each image, in the order of the input. `matches` has every pair of observations of
@@ -114,7 +115,7 @@ def parameters(calibration: Calibration, focal_px: float) -> tuple[str, list[flo
     return names[terms], [fx, cx, cy, k1, k2][: 3 + terms]
 
 
-def _write(connection: sqlite3.Connection, tracks: Tracks, result: Result | None) -> None:
+def _write(connection: sqlite3.Connection, tracks: Tracks, result: ResultData | None) -> None:
     image_ids = _cameras_and_images(connection, tracks, result)
     # Which keypoint of its image each observation is.
     order = np.argsort(tracks.view_index, kind="stable")
@@ -138,7 +139,7 @@ def _write(connection: sqlite3.Connection, tracks: Tracks, result: Result | None
         connection.execute("INSERT INTO two_view_geometries VALUES (?, ?, 2, ?, ?, ?, ?, ?, ?, ?)", values + geometry)
 
 
-def _cameras_and_images(connection: sqlite3.Connection, tracks: Tracks, result: Result | None) -> list[int]:
+def _cameras_and_images(connection: sqlite3.Connection, tracks: Tracks, result: ResultData | None) -> list[int]:
     """Writes cameras and images; returns the id of the image of each view."""
     by_name = {model.name: model.id for model in MODELS}
     all_sizes = sizes(tracks, result)
@@ -213,7 +214,7 @@ def _pairs(tracks: Tracks, points: NDArray[np.int64], keypoint: NDArray[np.int64
     ]
 
 
-def _geometry(result: Result | None, first: int, second: int) -> tuple[Any, ...]:
+def _geometry(result: ResultData | None, first: int, second: int) -> tuple[Any, ...]:
     """Kind, F, E, H, rotation and translation of a pair of views, as COLMAP's columns."""
     if result is None:
         return (_UNCALIBRATED, None, None, None, None, None)

@@ -8,8 +8,9 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
+from .._result_data import ResultData
+from .._result_parts import Calibration, Camera
 from ..errors import FailedPrecondition, InvalidArgument, Violation
-from ..result import Calibration, Camera, Result
 from ..tracks import Label, Tracks
 
 __all__ = ["Intrinsics", "Model", "check", "colour", "models", "points_of_observations", "quaternion", "sizes"]
@@ -44,7 +45,7 @@ class Model:
     names: tuple[str, ...]
     """Name of the image of each of `views`."""
 
-    result: Result
+    result: ResultData
     tracks: Tracks
 
     @cached_property
@@ -77,7 +78,7 @@ class Model:
         return found
 
 
-def check(tracks: Tracks, result: Result) -> None:
+def check(tracks: Tracks, result: ResultData) -> None:
     """Raises an `InvalidArgument` where a result is not one of these tracks."""
     told = (len(result.cameras), len(result.tracks.inlier), len(result.observations.inlier))
     given = (len(tracks.views), tracks.track_count, len(tracks))
@@ -86,7 +87,7 @@ def check(tracks: Tracks, result: Result) -> None:
         raise InvalidArgument(f"result: {what}", reason="INVALID_ARGUMENT", violations=[Violation("result", what)])
 
 
-def sizes(tracks: Tracks, result: Result | None = None) -> list[tuple[int, int]]:
+def sizes(tracks: Tracks, result: ResultData | None = None) -> list[tuple[int, int]]:
     """Size of every image; of an unknown one, that which has the principal point or the points in it."""
     found = []
     for index, view in enumerate(tracks.views):
@@ -103,7 +104,7 @@ def sizes(tracks: Tracks, result: Result | None = None) -> list[tuple[int, int]]
     return found
 
 
-def points_of_observations(tracks: Tracks, result: Result) -> NDArray[np.int64]:
+def points_of_observations(tracks: Tracks, result: ResultData) -> NDArray[np.int64]:
     """Which point each observation shows.
 
     The index of its track for the track's own, behind all tracks the position among the splits for another; -1: none.
@@ -118,7 +119,7 @@ def points_of_observations(tracks: Tracks, result: Result) -> NDArray[np.int64]:
     return place
 
 
-def models(tracks: Tracks, result: Result) -> list[Model]:
+def models(tracks: Tracks, result: ResultData) -> list[Model]:
     """The parts of a metric result, the largest first.
 
     Raises:
@@ -138,7 +139,7 @@ def models(tracks: Tracks, result: Result) -> list[Model]:
     ]
 
 
-def _model(tracks: Tracks, result: Result, part: int, posed: list[Camera]) -> Model:
+def _model(tracks: Tracks, result: ResultData, part: int, posed: list[Camera]) -> Model:
     all_sizes = sizes(tracks, result)
     names = tracks.names
     has_own_focal = any(view.HasField("focal_px") for view in result.message.views)

@@ -14,8 +14,8 @@ from typing import Any
 import numpy as np
 
 from .._read.colmap import FIRST_PIXEL
+from .._result_data import ResultData
 from ..errors import InvalidArgument, Violation
-from ..result import Result
 from ..tracks import Tracks
 from .model import Intrinsics, Model, colour, models
 
@@ -25,7 +25,7 @@ _POINTS = "sparse_pc.ply"
 
 
 def to_nerfstudio(
-    tracks: Tracks, path: str | PathLike[str], result: Result, *, part: int = 0, images: str = "images"
+    tracks: Tracks, path: str | PathLike[str], result: ResultData, *, part: int = 0, images: str = "images"
 ) -> None:
     """Writes `transforms.json` and `sparse_pc.ply` of one part of a metric result.
 

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from .._read.tables import frame
-from ..result import Result
+from .._result_data import ResultData
 from ..tracks import Tracks
 from .model import Floats, Intrinsics, Model, colour, models, quaternion
 
@@ -24,7 +24,7 @@ _MIDDLE_PX = 1e-6
 """Distance of a principal point from the middle of the image below which it is the middle."""
 
 
-def to_opensfm(tracks: Tracks, path: str | PathLike[str], result: Result) -> None:
+def to_opensfm(tracks: Tracks, path: str | PathLike[str], result: ResultData) -> None:
     """Writes `reconstruction.json` of a metric result: a list of reconstructions, one a part, the largest first.
 
     Args:
