@@ -5,7 +5,7 @@ use std::time::Duration;
 
 use serde_json::json;
 
-use super::evaluate_suite::{incomplete, with_note};
+use super::evaluate_suite::{RunCounts, with_note};
 use super::exit::{Exit, Failure};
 use super::interrupt::Interrupt;
 use super::print;
@@ -92,26 +92,27 @@ pub async fn run(args: &RealArgs, out: &std::path::Path, json: bool, quiet: bool
     relay.abort();
     bar.finish();
     let rows = outcome.map_err(Failure::internal)?;
-    let note = incomplete(rows.len(), sides * sequences.len());
-    let text = write(out, &rows, &options, note.as_deref())?;
-    print(&if json { text.trim_end().to_owned() } else { with_note(table::text(&rows), note) })?;
+    let counts = RunCounts { done: rows.len(), planned: sides * sequences.len() };
+    let text = write(out, &rows, &options, counts)?;
+    print(&if json { text.trim_end().to_owned() } else { with_note(table::text(&rows), counts.note()) })?;
     if stop.is_stopped() {
         return Err(Failure::interrupted_with("interrupted; the rows so far were written"));
     }
     Ok(Exit::Done)
 }
 
-/// Writes the three files; returns the JSON. `note`: what there is to say of runs that are missing.
-fn write(out: &std::path::Path, rows: &[Row], options: &Options, note: Option<&str>) -> Result<String, Failure> {
-    let text = pretty(&json!({
-        "complete": note.is_none(),
+/// Writes the three files; returns the JSON.
+fn write(out: &std::path::Path, rows: &[Row], options: &Options, counts: RunCounts) -> Result<String, Failure> {
+    let mut figures = json!({
         "version": env!("CARGO_PKG_VERSION"),
         "peer": (!options.peer.is_empty()).then_some(&options.peer),
         "rows": rows,
-    }))?;
+    });
+    counts.add_to(&mut figures);
+    let text = pretty(&figures)?;
     write_atomically(out, "real.json", text.as_bytes())?;
     write_atomically(out, "real.csv", table::csv(rows).as_bytes())?;
-    write_atomically(out, "real.html", page::page(rows, &options.peer, note).as_bytes())?;
+    write_atomically(out, "real.html", page::page(rows, &options.peer, counts.note().as_deref()).as_bytes())?;
     Ok(text)
 }
 

@@ -120,9 +120,10 @@ impl SuiteRunner<'_> {
         bar.finish();
         outcome?;
         let done = runs.iter().filter(|run| records.get(run).is_some()).count();
-        let note = incomplete(done, runs.len());
+        let counts = RunCounts { done, planned: runs.len() };
+        let note = counts.note();
         let (mut json, table) = figures(&records, note.as_deref())?;
-        json["complete"] = json!(note.is_none());
+        counts.add_to(&mut json);
         let json = written(self.out, file, json)?;
         print(&if self.json { json.trim_end().to_owned() } else { with_note(table, note) })?;
         if stop.is_stopped() {
@@ -132,9 +133,30 @@ impl SuiteRunner<'_> {
     }
 }
 
-/// What figures say of an evaluation whose runs are not all done.
-pub fn incomplete(done: usize, runs: usize) -> Option<String> {
-    (done < runs).then(|| format!("Incomplete: {done} of {runs} runs are done."))
+/// How many runs of an evaluation are done.
+#[derive(Debug, Clone, Copy)]
+pub struct RunCounts {
+    pub done: usize,
+    pub planned: usize,
+}
+
+impl RunCounts {
+    fn is_complete(self) -> bool {
+        self.done >= self.planned
+    }
+
+    /// What figures say where runs are missing.
+    pub fn note(self) -> Option<String> {
+        let Self { done, planned } = self;
+        (!self.is_complete()).then(|| format!("Incomplete: {done} of {planned} runs are done."))
+    }
+
+    /// Adds the same to figures for programs.
+    pub fn add_to(self, figures: &mut Value) {
+        figures["complete"] = json!(self.is_complete());
+        figures["runs_done"] = json!(self.done);
+        figures["runs_planned"] = json!(self.planned);
+    }
 }
 
 /// A table and below it what there is to note.

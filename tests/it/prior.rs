@@ -107,7 +107,8 @@ fn priors_are_compared_in_a_table_and_a_file() {
     let written = fs::read_to_string(directory.path().join("priors.json")).expect("priors.json");
     let written: Value = serde_json::from_str(&written).expect("JSON");
     let rows = written["rows"]["auto"].as_array().expect("rows");
-    assert_eq!(written["complete"], true, "{written}");
+    let counts = (&written["complete"], &written["runs_done"], &written["runs_planned"]);
+    assert_eq!(counts, (&true.into(), &1.into(), &1.into()), "{written}");
     assert!(!compared.stdout.contains("Incomplete"), "{compared:?}");
     assert!(rows.len() == 2 && rows.iter().all(|row| row["seeds"] == 1), "{written}");
     let lines = || fs::read_to_string(directory.path().join("priors.jsonl")).expect("records").lines().count();
@@ -143,6 +144,8 @@ fn an_interrupted_comparison_says_what_it_has() {
     let rows = printed["rows"]["auto"].as_array().expect("rows");
     assert!(rows.iter().any(|row| row["condition"] == "outliers .9"), "{printed}");
     assert_eq!(printed["complete"], false, "{printed}");
+    let done = printed["runs_done"].as_u64().expect("a count");
+    assert!((1..2000).contains(&done) && printed["runs_planned"] == 2000, "{printed}");
     let written = fs::read_to_string(directory.path().join("priors.json")).expect("priors.json");
     assert_eq!(written.trim_end(), stdout.trim_end());
     let (_, table) = interrupted(&[]);
