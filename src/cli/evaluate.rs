@@ -227,7 +227,7 @@ pub async fn run(args: Args) -> Result<Exit, Failure> {
     if runs.is_empty() {
         return Err(Failure::usage("no method has anything to say of these sweeps and depths: give others"));
     }
-    suite.run(runner::RECORDS, &runs, runner::measure, describe, "summary.json", |records, note| {
+    suite.run_described(runner::RECORDS, &runs, runner::measure, describe, "summary.json", |records, note| {
         let cells = summary::cells(&plan, records);
         Ok((write_summary(&args.out, &plan, records, &cells, note)?, table(&cells)))
     })

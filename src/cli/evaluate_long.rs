@@ -30,17 +30,10 @@ pub struct LongArgs {
 /// A text that no motion has in its name, as wrong usage; files that cannot be written, a defect of the solver.
 pub fn run(scenes: &[&str], seeds: u64, suite: &SuiteRunner) -> Result<Exit, Failure> {
     let plan = Plan { motions: chosen(MOTIONS.to_vec(), |motion| motion.name().to_owned(), scenes, None)?, seeds };
-    suite.run(
-        RECORDS,
-        &plan.runs(),
-        observations::measure,
-        |_| String::new(),
-        "long.json",
-        |records, _| {
-            let rows = plan.rows(records);
-            Ok((json!({ "seeds": seeds, "rows": rows }), long::text(&rows)))
-        },
-    )
+    suite.run(RECORDS, &plan.runs(), observations::measure, "long.json", |records| {
+        let rows = plan.rows(records);
+        (json!({ "seeds": seeds, "rows": rows }), long::text(&rows))
+    })
 }
 
 #[cfg(test)]

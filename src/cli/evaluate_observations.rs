@@ -22,15 +22,8 @@ pub struct ObservationArgs {
 pub fn run(scenes: &[&str], seeds: u64, peer: Vec<String>, suite: &SuiteRunner) -> Result<Exit, Failure> {
     let plan =
         Plan { conditions: chosen(conditions::all(), |condition| condition.name.clone(), scenes, None)?, seeds, peer };
-    suite.run(
-        observations::RECORDS,
-        &plan.runs(),
-        observations::measure,
-        |_| String::new(),
-        "observations.json",
-        |records, _| {
-            let rows = plan.rows(records);
-            Ok((json!({ "seeds": plan.seeds, "peer": plan.peer, "rows": rows }), table::text(&rows)))
-        },
-    )
+    suite.run(observations::RECORDS, &plan.runs(), observations::measure, "observations.json", |records| {
+        let rows = plan.rows(records);
+        (json!({ "seeds": plan.seeds, "peer": plan.peer, "rows": rows }), table::text(&rows))
+    })
 }

@@ -42,21 +42,11 @@ pub fn run(scenes: &[&str], seeds: Range<u64>, peer: Vec<String>, suite: &SuiteR
         format!("those of {count} seeds (--seeds) from {first} on (--first-seed), whose names join with / {words}");
     let all = photographed::scenes(seeds);
     let plan = Plan { scenes: chosen(all, PhotographedOptions::name, scenes, Some(there_are))?, peer };
-    suite.run(
-        RECORDS,
-        &plan.runs(),
-        observations::measure,
-        |_| String::new(),
-        "photographed.json",
-        |records, _| {
-            let tables = plan.tables(records);
-            let scenes = plan.scenes.len();
-            Ok((
-                json!({ "first_seed": first, "seeds": count, "scenes": scenes, "peer": plan.peer, "tables": tables }),
-                table::text(&tables),
-            ))
-        },
-    )
+    suite.run(RECORDS, &plan.runs(), observations::measure, "photographed.json", |records| {
+        let (scenes, peer, tables) = (plan.scenes.len(), &plan.peer, plan.tables(records));
+        let json = json!({ "first_seed": first, "seeds": count, "scenes": scenes, "peer": peer, "tables": tables });
+        (json, table::text(&tables))
+    })
 }
 
 #[cfg(test)]

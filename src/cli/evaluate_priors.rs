@@ -32,29 +32,15 @@ pub fn run(args: &PriorArgs, texts: &[&str], seeds: u64, suite: &SuiteRunner) ->
     let conditions = chosen(scenes::all(), |condition| condition.name.to_owned(), texts, None)?;
     if args.sweep {
         let runs = sweep::runs(&conditions, seeds);
-        return suite.run(
-            sweep::RECORDS,
-            &runs,
-            sweep::measure,
-            |_| String::new(),
-            "sweep.json",
-            |records, _| {
-                let rows = sweep::rows(&conditions, seeds, records);
-                let json = json!({ "seeds": seeds, "costs_per_nat": sweep::COSTS_PER_NAT, "rows": rows });
-                Ok((json, sweep::text(&rows)))
-            },
-        );
+        return suite.run(sweep::RECORDS, &runs, sweep::measure, "sweep.json", |records| {
+            let rows = sweep::rows(&conditions, seeds, records);
+            let json = json!({ "seeds": seeds, "costs_per_nat": sweep::COSTS_PER_NAT, "rows": rows });
+            (json, sweep::text(&rows))
+        });
     }
     let plan = Plan { conditions, seeds, each_prior: !args.auto_only };
-    suite.run(
-        priors::RECORDS,
-        &plan.runs(),
-        priors::measure,
-        |_| String::new(),
-        "priors.json",
-        |records, _| {
-            let rows = plan.rows(records);
-            Ok((json!({ "seeds": seeds, "rows": rows }), table::text(&rows)))
-        },
-    )
+    suite.run(priors::RECORDS, &plan.runs(), priors::measure, "priors.json", |records| {
+        let rows = plan.rows(records);
+        (json!({ "seeds": seeds, "rows": rows }), table::text(&rows))
+    })
 }

@@ -84,13 +84,35 @@ pub struct SuiteRunner<'a> {
 impl SuiteRunner<'_> {
     /// Does what the records of this name lack, and writes and prints the figures of all that is recorded.
     ///
-    /// * `describe`: what the progress says of a finished run
     /// * `file`: that of the figures
-    /// * `figures`: as JSON and as a table, told what there is to note of runs that are missing
+    /// * `figures`: as JSON and as a table
     ///
     /// # Errors
     /// Files that cannot be read or written, a defect of the solver; interrupted, after the figures so far were given.
     pub fn run<R, M>(
+        &self,
+        name: &str,
+        runs: &[R],
+        measure: fn(&R, &StopToken) -> Result<Option<M>, String>,
+        file: &str,
+        figures: impl FnOnce(&Records<R, M>) -> (Value, String),
+    ) -> Result<Exit, Failure>
+    where
+        R: Serialize + DeserializeOwned + Sync,
+        M: Serialize + DeserializeOwned + Clone + Send,
+    {
+        self.run_described(name, runs, measure, |_| String::new(), file, |records, _| Ok(figures(records)))
+    }
+
+    /// The same where runs differ so much in time that the progress has to say which is done, and where more than one
+    /// file of figures is written.
+    ///
+    /// * `describe`: what the progress says of a finished run
+    /// * `figures`: as JSON and as a table, given what there is to note of runs that are missing
+    ///
+    /// # Errors
+    /// See [`run`](Self::run).
+    pub fn run_described<R, M>(
         &self,
         name: &str,
         runs: &[R],
