@@ -8,6 +8,7 @@ use super::exit::{Exit, Failure};
 use super::job_view::GivenName;
 use super::print;
 use super::submit::GivenInput;
+use crate::client::{Client, OWN_TENANT};
 
 const EXAMPLES: &str = "\
 Examples:
@@ -40,9 +41,11 @@ pub async fn run(args: Args) -> Result<Exit, Failure> {
     // All of them are named before the first is gone, and one that is named twice goes once.
     let mut names = args.names.iter().map(|name| name.of(&args.server.access)).collect::<Result<Vec<_>, _>>()?;
     let mut inputs = args.inputs.iter().map(|given| given.of(&args.server.access)).collect::<Result<Vec<_>, _>>()?;
+    let mut client = args.server.connect().await?;
+    let tenants = names.iter_mut().map(|name| &mut name.tenant).chain(inputs.iter_mut().map(|name| &mut name.tenant));
+    name_own_tenant(tenants, &mut client).await?;
     keep_first(&mut names);
     keep_first(&mut inputs);
-    let mut client = args.server.connect().await?;
     for name in names {
         client.delete(&name).await?;
         print(&name.to_string())?;
@@ -52,6 +55,20 @@ pub async fn run(args: Args) -> Result<Exit, Failure> {
         print(&name.to_string())?;
     }
     Ok(Exit::Done)
+}
+
+/// Gives names of the key's tenant that tenant's id, so that a job that is named by its id and in full is one, and what
+/// is printed names it wherever it is read.
+async fn name_own_tenant(tenants: impl Iterator<Item = &mut String>, client: &mut Client) -> Result<(), Failure> {
+    let own: Vec<&mut String> = tenants.filter(|tenant| *tenant == OWN_TENANT).collect();
+    if own.is_empty() {
+        return Ok(());
+    }
+    // Of a tenant that has nothing, the server says that nothing is there.
+    if let Some(id) = client.own_tenant().await? {
+        own.into_iter().for_each(|tenant| tenant.clone_from(&id));
+    }
+    Ok(())
 }
 
 /// Leaves out what comes again.

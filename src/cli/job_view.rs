@@ -244,8 +244,11 @@ pub async fn watch_to_end(client: &mut Client, name: &JobName, after: u64, json:
         }
     };
     let mut reached = after;
+    // As the server names it, where the key names the tenant.
+    let mut whole_name = None;
     let mut on_numbered = |event: &JobEvent| {
         reached = event.sequence.unwrap_or(reached);
+        whole_name.get_or_insert_with(|| event.job.clone());
         on_event(event);
     };
     let mut signals = Signals::listen()?;
@@ -255,7 +258,8 @@ pub async fn watch_to_end(client: &mut Client, name: &JobName, after: u64, json:
         () = signals.next() => None,
     };
     view.finish();
-    let job = Lost { name, server: &server, after: reached, files: " --out DIR" };
+    let whole_name = whole_name.as_ref().unwrap_or(name);
+    let job = Lost { name: whole_name, server: &server, after: reached, files: " --out DIR" };
     let Some(watched) = watched else {
         return Err(Failure::interrupted_with(format!("interrupted; the job goes on\n{}", taken_up_again(&job))));
     };

@@ -9,7 +9,7 @@ use sha2::{Digest, Sha256};
 use tonic::{Status, Streaming};
 
 use super::backoff::Backoff;
-use super::{Client, Error, InputData};
+use super::{Client, Error, InputData, OWN_TENANT};
 use crate::domain::job::{EventBody, Failure, Job, JobEvent, JobName, JobState};
 use crate::domain::{InputName, Solution, SolveSettings};
 use crate::rpc::convert;
@@ -110,6 +110,22 @@ impl Client {
             self.call(request, |mut client, request| async move { client.jobs.list_jobs(request).await }).await?;
         let jobs = page.jobs.into_iter().map(convert::job::from_wire).collect::<Result<_, _>>()?;
         Ok(Page { jobs, next_page_token: page.next_page_token })
+    }
+
+    /// The tenant of the calls. Where the key alone says which, it is that in the names of its jobs and inputs; `None`
+    /// where it has neither.
+    ///
+    /// # Errors
+    /// See [`Error`].
+    pub async fn own_tenant(&mut self) -> Result<Option<String>, Error> {
+        if self.tenant != OWN_TENANT {
+            return Ok(Some(self.tenant.clone()));
+        }
+        if let Some(job) = self.list("", 1, "").await?.jobs.into_iter().next() {
+            return Ok(Some(job.name.tenant));
+        }
+        let input = self.list_inputs(1, "").await?.inputs.into_iter().next();
+        Ok(input.and_then(|input| InputName::parse(&input.name)).map(|name| name.tenant))
     }
 
     /// Cancels a job: one that waits at once, one that runs soon; one that has ended stays as it is. Returns it as it

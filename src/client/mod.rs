@@ -54,7 +54,7 @@ use tonic::{Response, Status};
 pub use error::{Error, ErrorKind};
 pub use input_data::InputData;
 pub use jobs::{JobOptions, Page, ended, ended_as};
-pub use options::{ApiKey, Options, Setting};
+pub use options::{ApiKey, OWN_TENANT, Options, Setting};
 pub use upload::EncodedInput;
 pub use uploaded_inputs::InputPage;
 

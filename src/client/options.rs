@@ -14,7 +14,7 @@ use crate::domain::job::{DEFAULT_TENANT, JobName};
 use crate::rpc::{keys, tls};
 
 /// What stands in names for the tenant of the key, which the server knows.
-const OWN_TENANT: &str = "-";
+pub const OWN_TENANT: &str = "-";
 
 /// Who calls, and whom to trust. The default sends no key and trusts the authorities of the system.
 #[derive(Debug, Clone, Default)]

@@ -164,6 +164,25 @@ async fn commands_are_let_in_and_no_secret_is_told() {
     expect(run_with(with(&["get", "a"]), &[("SCPSFM_API_KEY", NORTH)]), 0, "tenants/north/jobs/a");
     expect(run_with(with(&["get", "tenants/-/jobs/a"]), &[("SCPSFM_API_KEY", NORTH)]), 0, "tenants/north/jobs/a");
     expect(run_with(with(&["get", "a"]), &[("SCPSFM_API_KEY", SOUTH)]), 65, "there is no job tenants/south/jobs/a");
+    // Named twice, by the key's tenant and in full, it goes once; what is printed names the tenant.
+    let mut again = with(&["submit", "--method", "geometry", "--job-id", "b"]);
+    again.push(text(&input));
+    expect(run_with(again, &north), 0, "tenants/north/jobs/b");
+    let key = [("SCPSFM_API_KEY", NORTH)];
+    expect(run_with(with(&["watch", "b"]), &key), 3, "next: scpsfm result tenants/north/jobs/b");
+    let deleted = run_with(with(&["delete", "b", "tenants/north/jobs/b", "tenants/-/jobs/b"]), &key);
+    assert_eq!(deleted.stdout, "tenants/north/jobs/b\n", "{deleted:?}");
+    let none = run_with(with(&["delete", "b"]), &[("SCPSFM_API_KEY", SOUTH)]);
+    expect(none, 65, "there is no job tenants/south/jobs/b");
+    let mut upload = with(&["upload"]);
+    upload.push(text(&input));
+    let uploaded = run_with(upload, &key);
+    let name = uploaded.stdout.trim();
+    let id = name.strip_prefix("tenants/north/inputs/").expect("a name of this tenant");
+    let mut delete = with(&["delete"]);
+    delete.extend(["--input", id, "--input", name]);
+    let deleted = run_with(delete, &key);
+    assert_eq!(deleted.stdout, uploaded.stdout, "{deleted:?}");
     let other = [("SCPSFM_API_KEY", SOUTH), ("SCPSFM_TENANT", "north")];
     expect(run_with(with(&["list"]), &other), 65, "no tenant tenants/north, or the caller's key is not of it");
     expect(run_with(with(&["list"]), &[]), 77, "--api-key-file");
