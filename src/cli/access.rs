@@ -1,10 +1,13 @@
 //! The flags on the access to a server.
 
+use std::fmt::Display;
 use std::path::PathBuf;
 
-use clap::Args;
+use clap::parser::ValueSource;
+use clap::{Arg, ArgMatches, Args, Command, FromArgMatches};
 
 use super::exit::Failure;
+use super::job_view::quoted;
 use crate::client::{ApiKey, Options, Setting};
 
 /// The variable that may hold the API key. No flag does: other users of the machine see flags.
@@ -17,9 +20,8 @@ const ACCESS: &str = "Access to the server";
 /// Who calls, and whom to trust.
 #[derive(Debug, Clone, Default, Args)]
 pub struct AccessArgs {
-    /// Tenant whose jobs these are [default: that of the API key; without a key `default`]
-    #[arg(long, help_heading = ACCESS, value_name = "ID", env = "SCPSFM_TENANT")]
-    pub tenant: Option<String>,
+    #[command(flatten)]
+    pub tenant: TenantArg,
 
     /// File with the API key; without it, the variable SCPSFM_API_KEY
     #[arg(long, help_heading = ACCESS, value_name = "FILE")]
@@ -43,9 +45,33 @@ pub struct AccessArgs {
 }
 
 impl AccessArgs {
+    /// The flags that were given, each with a space before it. What came from variables is there for the next command,
+    /// too.
+    pub fn flags(&self) -> String {
+        let files = [
+            ("--api-key-file", &self.api_key_file),
+            ("--tls-ca", &self.tls_ca),
+            ("--tls-cert", &self.tls_cert),
+            ("--tls-key", &self.tls_key),
+        ];
+        let mut flags = String::new();
+        if let Some(tenant) = self.tenant.flag() {
+            flags.push_str(&format!(" --tenant {}", quoted(tenant)));
+        }
+        for (flag, file) in files {
+            if let Some(file) = file {
+                flags.push_str(&format!(" {flag} {}", quoted(&file.to_string_lossy())));
+            }
+        }
+        if self.plaintext_keys {
+            flags.push_str(" --plaintext-keys");
+        }
+        flags
+    }
+
     /// Whether anything was said that has no meaning without a server.
     pub fn is_given(&self) -> bool {
-        self.api_key_file.is_some() || self.tls_ca.is_some() || self.tls_cert.is_some() || self.plaintext_keys
+        !self.flags().is_empty()
     }
 
     /// The tenant as names have it: `-` is that of the key.
@@ -62,7 +88,7 @@ impl AccessArgs {
     /// For a key that cannot be read or is none, as wrong usage.
     pub fn options(&self) -> Result<Options, Failure> {
         Ok(Options {
-            tenant: self.tenant.clone(),
+            tenant: self.tenant.id.clone(),
             api_key: self.api_key()?,
             tls_ca: self.tls_ca.clone(),
             tls_cert: self.tls_cert.clone(),
@@ -89,6 +115,64 @@ impl AccessArgs {
         };
         let key = ApiKey::new(text.trim());
         key.map(Some).map_err(|error| Failure::usage(with_name(&error.message, Setting::ApiKey, &source)))
+    }
+}
+
+/// Whose jobs these are. A variable is a default, which a name that has a tenant replaces; a flag is not, and where the
+/// two differ one of them is a slip.
+#[derive(Debug, Clone, Default, PartialEq, Eq)]
+pub struct TenantArg {
+    /// `None`: that of the key.
+    pub id: Option<String>,
+    pub is_flag: bool,
+}
+
+impl TenantArg {
+    const ID: &str = "tenant";
+
+    /// What the flag says.
+    fn flag(&self) -> Option<&str> {
+        self.id.as_deref().filter(|_| self.is_flag)
+    }
+
+    /// Refuses a full name of another tenant than that of the flag.
+    ///
+    /// # Errors
+    /// As wrong usage.
+    pub fn check(&self, tenant: &str, name: &impl Display) -> Result<(), Failure> {
+        match self.flag() {
+            Some(flag) if flag != tenant => Err(Failure::usage(format_args!(
+                "--tenant {flag}: {name} is of the tenant {tenant}; leave one of the two out"
+            ))),
+            _ => Ok(()),
+        }
+    }
+}
+
+impl Args for TenantArg {
+    fn augment_args(command: Command) -> Command {
+        let help = "Tenant whose jobs these are; a full name of another tenant is refused beside it [default: that of \
+                    the API key; without a key `default`]";
+        let arg = Arg::new(Self::ID).long(Self::ID).help_heading(ACCESS).value_name("ID").env("SCPSFM_TENANT");
+        command.arg(arg.help(help))
+    }
+
+    fn augment_args_for_update(command: Command) -> Command {
+        Self::augment_args(command)
+    }
+}
+
+impl FromArgMatches for TenantArg {
+    fn from_arg_matches(matches: &ArgMatches) -> Result<Self, clap::Error> {
+        Ok(Self {
+            id: matches.get_one::<String>(Self::ID).cloned(),
+            is_flag: matches.value_source(Self::ID) == Some(ValueSource::CommandLine),
+        })
+    }
+
+    fn update_from_arg_matches(&mut self, matches: &ArgMatches) -> Result<(), clap::Error> {
+        *self = Self::from_arg_matches(matches)?;
+        Ok(())
     }
 }
 
@@ -132,8 +216,26 @@ mod tests {
     }
 
     #[test]
+    fn the_flags_that_were_given_are_told_again() {
+        let args = |words: &[&str]| {
+            let command = AccessArgs::augment_args(Command::new("test"));
+            let matches = command.try_get_matches_from([&["test"], words].concat()).expect("flags");
+            AccessArgs::from_arg_matches(&matches).expect("flags")
+        };
+        assert_eq!(args(&[]).flags(), "");
+        let tls = ["--tls-ca", "ca.pem", "--tls-cert", "c.pem", "--tls-key", "k.pem"];
+        let all = [&["--tenant", "north", "--api-key-file", "a key"], &tls[..], &["--plaintext-keys"]].concat();
+        let told = args(&all).flags();
+        assert_eq!(told, format!(" --tenant north --api-key-file 'a key' {} --plaintext-keys", tls.join(" ")));
+        let tenant = TenantArg { id: Some("north".into()), is_flag: false };
+        assert_eq!(AccessArgs { tenant, ..AccessArgs::default() }.flags(), "", "the variable is still there");
+        assert!(args(&["--tenant", "north"]).is_given() && !args(&[]).is_given());
+    }
+
+    #[test]
     fn what_is_no_tenant_is_told_by_its_flag() {
-        let access = AccessArgs { tenant: Some("North".into()), ..AccessArgs::default() };
+        let tenant = TenantArg { id: Some("North".into()), is_flag: true };
+        let access = AccessArgs { tenant, ..AccessArgs::default() };
         let failure = access.tenant().expect_err("capitals");
         assert_eq!(failure.exit, Exit::Usage);
         assert!(failure.message.starts_with("--tenant or SCPSFM_TENANT \"North\" is not"), "{failure}");

@@ -6,6 +6,7 @@ use clap::Args;
 
 use super::access::AccessArgs;
 use super::exit::Failure;
+use super::job_view::quoted;
 use crate::client::{Client, MAX_WAIT};
 use crate::parallel::Threads;
 
@@ -24,6 +25,11 @@ pub struct ServerArgs {
 }
 
 impl ServerArgs {
+    /// The flags with which another command reaches the same server in the same way, each with a space before it.
+    pub fn flags(&self) -> String {
+        format!(" --server {}{}", quoted(&self.server), self.access.flags())
+    }
+
     /// Connects to it; where a call has to wait, it is told on stderr.
     ///
     /// # Errors

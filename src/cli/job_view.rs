@@ -37,10 +37,10 @@ impl GivenName {
     /// The whole name.
     ///
     /// # Errors
-    /// For a tenant that is none.
+    /// For a tenant that is none, and a flag that names another one, as wrong usage.
     pub fn of(&self, access: &AccessArgs) -> Result<JobName, Failure> {
         match self {
-            Self::Whole(name) => Ok(name.clone()),
+            Self::Whole(name) => access.tenant.check(&name.tenant, name).map(|()| name.clone()),
             Self::Id(job) => Ok(JobName { tenant: access.tenant()?, job: job.clone() }),
         }
     }
@@ -226,7 +226,13 @@ pub fn show_event(view: &mut ProgressView, event: &JobEvent) {
 
 /// Follows a job to its end and ends as it did; with `json` one event a line on stdout. Where nothing came after
 /// `after` any more, it says so.
-pub async fn watch_to_end(client: &mut Client, name: &JobName, after: u64, json: bool) -> Result<Exit, Failure> {
+pub async fn watch_to_end(
+    client: &mut Client,
+    server: &ServerArgs,
+    name: &JobName,
+    after: u64,
+    json: bool,
+) -> Result<Exit, Failure> {
     let mut view = ProgressView::new(json);
     let mut result = None;
     let mut unprinted = Ok(());
@@ -252,14 +258,13 @@ pub async fn watch_to_end(client: &mut Client, name: &JobName, after: u64, json:
         on_event(event);
     };
     let mut signals = Signals::listen()?;
-    let server = client.server().to_owned();
     let watched = tokio::select! {
         watched = client.watch(name, after, &mut on_numbered) => Some(watched),
         () = signals.next() => None,
     };
     view.finish();
     let whole_name = whole_name.as_ref().unwrap_or(name);
-    let job = Lost { name: whole_name, server: &server, after: reached, files: " --out DIR" };
+    let job = Lost { name: whole_name, server, after: reached, files: " --out DIR" };
     let Some(watched) = watched else {
         return Err(Failure::interrupted_with(format!("interrupted; the job goes on\n{}", taken_up_again(&job))));
     };
@@ -286,7 +291,7 @@ pub async fn watch_to_end(client: &mut Client, name: &JobName, after: u64, json:
 /// Tells on stderr how to get the files of a result, and what would make it better.
 fn tell_next(job: &Lost, summary: &Summary) {
     let Lost { name, server, files, .. } = job;
-    tell!("next: scpsfm result {name} --server {}{files}", quoted(server));
+    tell!("next: scpsfm result {name}{}{files}", server.flags());
     if let Some(advice) = next_steps::advice(summary.into()) {
         tell!("      {advice}");
     }
@@ -296,7 +301,8 @@ fn tell_next(job: &Lost, summary: &Summary) {
 #[derive(Debug)]
 pub struct Lost<'a> {
     pub name: &'a JobName,
-    pub server: &'a str,
+    /// With which it was reached.
+    pub server: &'a ServerArgs,
     /// The last event that was seen.
     pub after: u64,
     /// Flags of `scpsfm result`.
@@ -317,9 +323,9 @@ pub fn lost(error: client::Error, job: &Lost) -> Failure {
 /// The commands that take a job up again.
 fn taken_up_again(job: &Lost) -> String {
     let Lost { name, server, after, files } = job;
-    let server = quoted(server);
+    let server = server.flags();
     let after = if *after > 0 { format!(" --after {after}") } else { String::new() };
-    format!("  scpsfm watch {name} --server {server}{after}\n  scpsfm result {name} --server {server}{files}")
+    format!("  scpsfm watch {name}{server}{after}\n  scpsfm result {name}{server}{files}")
 }
 
 /// A word as a shell reads it whole.
@@ -331,17 +337,30 @@ pub fn quoted(word: &str) -> String {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::cli::access::TenantArg;
 
     #[test]
     fn names_may_be_given_in_full_or_by_their_id() {
-        let of = |text: &str, tenant: Option<&str>| {
-            let access = AccessArgs { tenant: tenant.map(str::to_owned), ..AccessArgs::default() };
-            GivenName::parse(text).map(|given| given.of(&access).expect("a tenant").to_string())
+        let given = |text: &str, tenant: Option<&str>, is_flag: bool| {
+            let tenant = TenantArg { id: tenant.map(str::to_owned), is_flag };
+            let access = AccessArgs { tenant, ..AccessArgs::default() };
+            GivenName::parse(text).map(|given| given.of(&access))
         };
+        let of = |text: &str, tenant| given(text, tenant, false).map(|name| name.expect("a tenant").to_string());
         assert_eq!(of("a-1", None).as_deref(), Ok("tenants/default/jobs/a-1"));
         assert_eq!(of("a-1", Some("north")).as_deref(), Ok("tenants/north/jobs/a-1"));
         assert_eq!(of("tenants/south/jobs/a-1", Some("north")).as_deref(), Ok("tenants/south/jobs/a-1"));
         assert_eq!(of("tenants/-/jobs/a-1", None).as_deref(), Ok("tenants/default/jobs/a-1"));
+        let flag = |text: &str| given(text, Some("north"), true).expect("a name");
+        for same in ["a-1", "tenants/-/jobs/a-1", "tenants/north/jobs/a-1"] {
+            assert_eq!(flag(same).expect(same).to_string(), "tenants/north/jobs/a-1");
+        }
+        let refused = flag("tenants/south/jobs/a-1").expect_err("of another tenant");
+        assert_eq!(refused.exit, Exit::Usage);
+        assert!(
+            refused.message.starts_with("--tenant north: tenants/south/jobs/a-1 is of the tenant south"),
+            "{refused}"
+        );
         assert!(of("A", None).is_err());
         assert!(of("jobs/a", None).is_err());
         assert!(of("tenants/-/inputs/a", None).is_err());
@@ -352,14 +371,14 @@ mod tests {
     fn a_lost_server_leaves_the_commands_that_go_on() {
         let given = GivenName::parse("a-1").expect("a name");
         let name = given.of(&AccessArgs::default()).expect("a tenant");
-        let job = Lost { name: &name, server: "http://h:1", after: 7, files: " --out 'a b'" };
+        let access = AccessArgs { tls_ca: Some("ca.pem".into()), ..AccessArgs::default() };
+        let server = ServerArgs { server: "https://h:1".into(), access };
+        let job = Lost { name: &name, server: &server, after: 7, files: " --out 'a b'" };
         let words = lost(ErrorKind::Unavailable.error("gone"), &job).message;
         assert!(words.starts_with("gone\nthe job is tenants/default/jobs/a-1;"), "{words}");
-        assert!(words.contains("\n  scpsfm watch tenants/default/jobs/a-1 --server http://h:1 --after 7\n"), "{words}");
-        assert!(
-            words.ends_with("\n  scpsfm result tenants/default/jobs/a-1 --server http://h:1 --out 'a b'"),
-            "{words}"
-        );
+        let there = "tenants/default/jobs/a-1 --server https://h:1 --tls-ca ca.pem";
+        assert!(words.contains(&format!("\n  scpsfm watch {there} --after 7\n")), "{words}");
+        assert!(words.ends_with(&format!("\n  scpsfm result {there} --out 'a b'")), "{words}");
         assert_eq!(lost(ErrorKind::Refused.error("no"), &job).message, "no");
         assert_eq!((quoted("a/b.csv"), quoted("it's").as_str()), ("a/b.csv".to_owned(), "'it'\\''s'"));
     }

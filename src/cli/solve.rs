@@ -165,7 +165,7 @@ async fn on_server(
                 quoted(&args.input.input.to_string_lossy()),
                 args.input.reading.flags()
             );
-            job_view::lost(error, &Lost { name: &name, server: &server.server, after: 0, files: &files })
+            job_view::lost(error, &Lost { name: &name, server: &server, after: 0, files: &files })
         }
         _ => remote::at_lines(error, input),
     })

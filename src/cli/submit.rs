@@ -133,7 +133,11 @@ pub async fn run(args: Args) -> Result<Exit, Failure> {
         (None, None) => return Err(nothing()),
     };
     print(&job.name.to_string())?;
-    if args.watch { job_view::watch_to_end(&mut client, &job.name, 0, false).await } else { Ok(Exit::Done) }
+    if args.watch {
+        job_view::watch_to_end(&mut client, &args.server, &job.name, 0, false).await
+    } else {
+        Ok(Exit::Done)
+    }
 }
 
 /// An uploaded input's name as it was given: whole, or its last part alone.
@@ -158,10 +162,10 @@ impl GivenInput {
     /// The whole name.
     ///
     /// # Errors
-    /// For a tenant that is none.
+    /// For a tenant that is none, and a flag that names another one, as wrong usage.
     pub fn of(&self, access: &AccessArgs) -> Result<InputName, Failure> {
         match self {
-            Self::Whole(name) => Ok(name.clone()),
+            Self::Whole(name) => access.tenant.check(&name.tenant, name).map(|()| name.clone()),
             Self::Id(input) => Ok(InputName { tenant: access.tenant()?, input: input.clone() }),
         }
     }
@@ -206,11 +210,13 @@ fn parse_seconds(text: &str) -> Result<Duration, String> {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::cli::access::TenantArg;
 
     #[test]
     fn an_input_may_be_given_in_full_or_by_its_id() {
         let of = |text: &str| {
-            let access = AccessArgs { tenant: Some("north".into()), ..AccessArgs::default() };
+            let tenant = TenantArg { id: Some("north".into()), is_flag: false };
+            let access = AccessArgs { tenant, ..AccessArgs::default() };
             GivenInput::parse(text).map(|given| given.of(&access).expect("a tenant").to_string())
         };
         assert_eq!(of("a-1").as_deref(), Ok("tenants/north/inputs/a-1"));

@@ -37,5 +37,5 @@ pub struct Args {
 pub async fn run(args: Args) -> Result<Exit, Failure> {
     let name = args.name.of(&args.server.access)?;
     let mut client = args.server.connect().await?;
-    job_view::watch_to_end(&mut client, &name, args.after, args.json).await
+    job_view::watch_to_end(&mut client, &args.server, &name, args.after, args.json).await
 }

@@ -169,7 +169,15 @@ async fn commands_are_let_in_and_no_secret_is_told() {
     again.push(text(&input));
     expect(run_with(again, &north), 0, "tenants/north/jobs/b");
     let key = [("SCPSFM_API_KEY", NORTH)];
-    expect(run_with(with(&["watch", "b"]), &key), 3, "next: scpsfm result tenants/north/jobs/b");
+    let mut watch = with(&["watch", "b"]);
+    watch.extend(["--tenant", "north", "--api-key-file", text(&key_file)]);
+    let (ca, file) = (text(&ours), text(&key_file));
+    let there = format!("--server {} --tenant north --api-key-file {file} --tls-ca {ca}", server.grpc);
+    expect(run_with(watch, &[]), 3, &format!("next: scpsfm result tenants/north/jobs/b {there} --out DIR"));
+    expect(run_with(with(&["watch", "b"]), &key), 3, "next: scpsfm result tenants/north/jobs/b --server");
+    let mut other_name = with(&["get", "tenants/south/jobs/a"]);
+    other_name.extend(["--tenant", "north"]);
+    expect(run_with(other_name, &key), 2, "--tenant north: tenants/south/jobs/a is of the tenant south");
     let deleted = run_with(with(&["delete", "b", "tenants/north/jobs/b", "tenants/-/jobs/b"]), &key);
     assert_eq!(deleted.stdout, "tenants/north/jobs/b\n", "{deleted:?}");
     let none = run_with(with(&["delete", "b"]), &[("SCPSFM_API_KEY", SOUTH)]);
