@@ -92,9 +92,9 @@ pub async fn run(args: Args) -> Result<Exit, Failure> {
     result_files::write(&args.out, &solution, Some(&input), &[])?;
     let comparison = Comparison::new(&scene, &solution);
     if args.json {
-        print(comparison.json(&args, &solution)?.trim_end())?;
+        print(comparison.json(&args, &solution, &input)?.trim_end())?;
     } else if !args.quiet {
-        print(comparison.text(&args, &scene, &solution).trim_end())?;
+        print(comparison.text(&args, &scene, &solution, &input).trim_end())?;
     }
     if comparison.inliers.f1 < LEAST_F1 {
         let what = format!(
@@ -144,10 +144,13 @@ impl Comparison {
         }
     }
 
-    fn text(&self, args: &Args, scene: &Scene, solution: &Solution) -> String {
+    fn text(&self, args: &Args, scene: &Scene, solution: &Solution, input: &LabelledInput) -> String {
         let right = scene.truth.inlier.iter().filter(|&&inlier| inlier).count();
-        let mut lines =
-            vec![summary::text(solution, None), String::new(), format!("  {:<16}{:>12}{:>12}", "", "found", "true")];
+        let mut lines = vec![
+            summary::text(solution, Some(input)),
+            String::new(),
+            format!("  {:<16}{:>12}{:>12}", "", "found", "true"),
+        ];
         lines.push(format!(
             "  {:<16}{:>12}{right:>12}   F1 {:.3} (precision {:.3}, recall {:.3})",
             "inlier tracks",
@@ -169,7 +172,7 @@ impl Comparison {
         lines.join("\n")
     }
 
-    fn json(&self, args: &Args, solution: &Solution) -> Result<String, Failure> {
+    fn json(&self, args: &Args, solution: &Solution, input: &LabelledInput) -> Result<String, Failure> {
         let value = json!({
             "seed": args.scene.seed,
             "f1": self.inliers.f1,
@@ -177,7 +180,7 @@ impl Comparison {
             "recall": self.inliers.recall,
             "focal_true_px": self.focal_true_px,
             "focal_error": self.focal_error,
-            "result": ResultJson::new(solution, None),
+            "result": ResultJson::new(solution, Some(input)),
         });
         Ok(pretty(&value)?)
     }

@@ -56,6 +56,9 @@ pub fn text(solution: &Solution, input: Option<&LabelledInput>) -> String {
             if solution.second_structures.is_empty() { "" } else { ", some of which agree on other motions" };
         fact("rejected", format!("{count} tracks{agreeing}"));
     }
+    if let (Status::Solved, None, count @ 1..) = (solution.status, tracks.rejected, tracks.others) {
+        fact("not counted", format!("{count} tracks, rejected or unclassified: the input tells them apart (--input)"));
+    }
     for counts in second_structures::counts(solution) {
         fact(&format!("structure {} ", counts.number), structure(&counts));
     }
@@ -180,7 +183,9 @@ mod tests {
         let (input, mut solution) = fixture::solved();
         let lines = text(&solution, Some(&input));
         assert!(lines.contains("rejected     20 tracks\n") && !lines.contains("unclassified"), "{lines}");
-        assert!(!text(&solution, None).contains("rejected"), "without the input nobody knows who sees them");
+        let without_input = text(&solution, None);
+        assert!(without_input.contains("not counted  20 tracks, rejected or unclassified: "), "{without_input}");
+        assert!(!without_input.contains("  rejected") && !lines.contains("not counted"), "{without_input}");
         solution.views[..3].iter_mut().for_each(|view| view.projection = None);
         let lines = text(&solution, Some(&input));
         assert!(lines.contains("unclassified 20 tracks: fewer than 3 registered views see them"), "{lines}");

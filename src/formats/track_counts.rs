@@ -3,7 +3,7 @@
 use super::LabelledInput;
 use crate::domain::{Method, Solution, Status, VERIFIED};
 
-/// How many tracks have which verdict; each track has one of the four.
+/// How many tracks have which verdict: each is an inlier, consistent in two views, unclassified or rejected.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct TrackCounts {
     pub inlier: usize,
@@ -14,6 +14,8 @@ pub struct TrackCounts {
     pub unclassified: Option<usize>,
     /// All others. `None` where `unclassified` is.
     pub rejected: Option<usize>,
+    /// The unclassified and the rejected ones together, which are known without the input, too.
+    pub others: usize,
 }
 
 impl TrackCounts {
@@ -21,9 +23,9 @@ impl TrackCounts {
         let inlier = solution.inlier_track_count();
         let two_view = solution.two_view_tracks.len();
         let unclassified = unclassified(solution, input);
-        let others = solution.tracks.inlier.len() - inlier;
-        let rejected = unclassified.map(|unclassified| others.saturating_sub(two_view + unclassified));
-        Self { inlier, two_view, unclassified, rejected }
+        let others = (solution.tracks.inlier.len() - inlier).saturating_sub(two_view);
+        let rejected = unclassified.map(|unclassified| others.saturating_sub(unclassified));
+        Self { inlier, two_view, unclassified, rejected, others }
     }
 }
 
@@ -57,18 +59,18 @@ mod tests {
     fn every_track_has_one_verdict() {
         let (input, mut solution) = fixture::solved();
         let counts = |solution: &Solution| TrackCounts::new(solution, Some(&input));
-        let all = TrackCounts { inlier: 20, two_view: 0, unclassified: Some(0), rejected: Some(20) };
+        let all = TrackCounts { inlier: 20, two_view: 0, unclassified: Some(0), rejected: Some(20), others: 20 };
         assert_eq!(counts(&solution), all);
         assert_eq!(TrackCounts::new(&solution, None), TrackCounts { unclassified: None, rejected: None, ..all });
         let outlier = solution.tracks.inlier.iter().position(|inlier| !inlier).expect("an outlier") as u32;
         solution.two_view_tracks = vec![TwoViewTrack { track: outlier, weight: 0.75, part: 0, point: None }];
-        assert_eq!(counts(&solution), TrackCounts { two_view: 1, rejected: Some(19), ..all });
+        assert_eq!(counts(&solution), TrackCounts { two_view: 1, rejected: Some(19), others: 19, ..all });
         solution.views[..3].iter_mut().for_each(|view| view.projection = None);
-        let few_views = TrackCounts { two_view: 1, unclassified: Some(19), rejected: Some(0), ..all };
+        let few_views = TrackCounts { two_view: 1, unclassified: Some(19), rejected: Some(0), others: 19, ..all };
         assert_eq!(counts(&solution), few_views);
         // The networks weigh every track, whoever sees it.
         solution.method = Method::Paper;
-        let weighed = TrackCounts { two_view: 1, rejected: Some(19), ..all };
+        let weighed = TrackCounts { two_view: 1, rejected: Some(19), others: 19, ..all };
         assert_eq!(counts(&solution), weighed);
         assert_eq!(TrackCounts::new(&solution, None), weighed);
         solution.status = Status::NoReconstruction;

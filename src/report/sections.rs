@@ -58,6 +58,9 @@ pub fn headline(solution: &Solution, input: Option<&LabelledInput>) -> String {
             [(tracks.two_view, "of two views, consistent"), (unclassified, "unclassified: too few views see them")];
         let others = others.iter().filter(|(count, _)| *count > 0).map(|(count, what)| format!("{count} {what}"));
         card("rejected tracks", rejected.to_string(), others.collect::<Vec<_>>().join("; "));
+    } else if solution.status == Status::Solved {
+        let note = "rejected or unclassified: the input, which was not at hand, tells them apart";
+        card("tracks not counted", tracks.others.to_string(), note.into());
     }
     let registered = solution.registered_views().len();
     card("views", format!("{registered} of {}", solution.views.len()), "registered".into());

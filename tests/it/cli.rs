@@ -342,6 +342,9 @@ fn the_demo_finds_what_is_true() {
     let figures = json(&run.stdout);
     assert!(figures["f1"].as_f64().is_some_and(|f1| f1 >= 0.95), "{figures}");
     assert_eq!(figures["result"]["status"], "SOLVED");
+    let counts = ["inlier_tracks", "two_view_tracks", "unclassified_tracks", "rejected_tracks"];
+    let counts = counts.map(|name| figures["result"][name].as_u64().expect(name));
+    assert_eq!(counts.iter().sum::<u64>(), 100, "{figures}");
     // Stages are told of jobs that take longer than this one does on a fast machine.
     for state in ["QUEUED", "RUNNING", "SUCCEEDED", "METRIC"] {
         assert!(run.stderr.contains(state), "{state} is not among {}", run.stderr);

@@ -61,6 +61,8 @@ fn a_server_gives_the_same_files_as_the_program_itself_and_drains_on_sigterm() {
     let name = listed.stdout.split_whitespace().find(|word| word.starts_with("tenants/")).expect("a job's name");
     let result = run(["result", name, "--json", "--server", &serving.grpc]);
     assert_eq!(json(&result.stdout)["inlier_tracks"], 30);
+    let told = run(["result", name, "--out", text(&path("told")), "--server", &serving.grpc]);
+    assert!(told.stdout.contains("not counted  30 tracks, rejected or unclassified: "), "{told:?}");
     let quiet = run(["result", name, "-q", "--out", text(&path("quiet")), "--server", &serving.grpc]);
     assert_eq!((quiet.code, quiet.stdout.as_str(), quiet.stderr.as_str()), (Some(0), "", ""), "{quiet:?}");
     assert!(path("quiet").join("report.html").exists());
