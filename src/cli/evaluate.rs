@@ -16,7 +16,7 @@ use super::evaluate_real::{self, RealArgs};
 use super::evaluate_suite::{SceneFilter, SuiteRunner};
 use super::exit::{self, Exit, Failure};
 use super::prior_file::PriorFileArgs;
-use crate::domain::SolveSettings;
+use crate::domain::{SolveSettings, counted};
 use crate::evaluation::plan::{Contestant, Depths, Plan, Run};
 use crate::evaluation::runner::{self, Records};
 use crate::evaluation::summary::{self, Cell};
@@ -237,7 +237,8 @@ pub async fn run(args: Args) -> Result<Exit, Failure> {
 fn describe(run: &Run) -> String {
     let Run { contestant, scene, .. } = run;
     let SceneOptions { views, tracks, outliers, noise, .. } = scene;
-    format!("{}: {views} views, {tracks} tracks, {outliers} outliers, {noise} noise", contestant.name())
+    let (views, tracks) = (counted(*views, "view"), counted(*tracks, "track"));
+    format!("{}: {views}, {tracks}, {outliers} outliers, {noise} noise", contestant.name())
 }
 
 /// Writes tables and figures; returns the JSON. `note`: what there is to say of runs that are missing.

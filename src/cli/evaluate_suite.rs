@@ -12,7 +12,7 @@ use super::exit::{Exit, Failure};
 use super::interrupt::Interrupt;
 use super::print;
 use super::progress::RunsView;
-use crate::domain::{Sha256Digest, StopToken};
+use crate::domain::{Sha256Digest, StopToken, counted};
 use crate::evaluation::records::{self, Records};
 use crate::formats::publish::{create_directory, pretty, write_atomically};
 use scpsfm_core::subspace;
@@ -170,7 +170,7 @@ impl RunCounts {
     /// What figures say where runs are missing.
     pub fn note(self) -> Option<String> {
         let Self { done, planned } = self;
-        (!self.is_complete()).then(|| format!("Incomplete: {done} of {planned} runs are done."))
+        (!self.is_complete()).then(|| format!("Incomplete: {done} of {} are done.", counted(planned, "run")))
     }
 
     /// Adds the same to figures for programs.

@@ -5,6 +5,7 @@ use serde_json::json;
 use super::args::{PageArgs, ServerArgs};
 use super::exit::{Exit, Failure};
 use super::print;
+use crate::domain::counted;
 use crate::rpc::proto;
 
 const EXAMPLES: &str = "\
@@ -50,7 +51,8 @@ fn created(input: &proto::Input) -> String {
 
 fn line(input: &proto::Input) -> String {
     let proto::Input { name, size_bytes, view_count, track_count, .. } = input;
-    format!("{name}  {}  {view_count} views, {track_count} tracks  {size_bytes} bytes", created(input))
+    let (views, tracks) = (counted(*view_count, "view"), counted(*track_count, "track"));
+    format!("{name}  {}  {views}, {tracks}  {size_bytes} bytes", created(input))
 }
 
 fn as_json(input: &proto::Input) -> String {

@@ -13,7 +13,7 @@ use super::print;
 use super::progress::ProgressView;
 use crate::client::{self, Client, ErrorKind};
 use crate::domain::job::{EventBody, Failure as JobFailure, Job, JobEvent, JobName, JobState, PastAttempt, Summary};
-use crate::domain::{Grade, InputName, Status, Warning, Webhook};
+use crate::domain::{Grade, InputName, Status, Warning, Webhook, counted};
 
 /// A job's name as it was given: whole, or its last part alone.
 #[derive(Debug, Clone, PartialEq, Eq)]
@@ -60,7 +60,7 @@ const DEADLINE_EXCEEDED: &str = "  its deadline passed before a result stood";
 /// A job in a line.
 pub fn job_line(job: &Job) -> String {
     let mut line = format!("{}  {:<9}  {}", job.name, job.state.name(), time(job.create_time));
-    line.push_str(&format!("  {} views, {} tracks", job.view_count, job.track_count));
+    line.push_str(&format!("  {}, {}", counted(job.view_count, "view"), counted(job.track_count, "track")));
     if let Some(summary) = &job.summary {
         line.push_str(&format!("  {}", summary_words(summary)));
     } else if let Some(failure) = &job.failure {
@@ -84,7 +84,8 @@ fn summary_words(summary: &Summary) -> String {
     }
     let grade = summary.grade.map_or("solved", Grade::name);
     let focal = summary.focal_px.map(|focal_px| format!(", focal {focal_px:.1} px")).unwrap_or_default();
-    format!("{grade}, {} inlier tracks{focal}, {:.1} s", summary.inlier_tracks, summary.seconds)
+    let tracks = counted(summary.inlier_tracks, "inlier track");
+    format!("{grade}, {tracks}{focal}, {:.1} s", summary.seconds)
 }
 
 /// The warnings of a result, a line each as `scpsfm solve` tells them; where there is no reconstruction, they say why.

@@ -9,7 +9,7 @@ use super::input_args::ReadingArgs;
 use super::job_view::GivenName;
 use super::next_steps::Files;
 use super::{print, summary};
-use crate::domain::Solution;
+use crate::domain::{Solution, counted};
 use crate::formats::{LabelledInput, result_files};
 
 const EXAMPLES: &str = "\
@@ -112,8 +112,10 @@ fn belongs_together(input: &LabelledInput, solution: &Solution) -> Result<(), Fa
     let of_file = (input.raw.views.len(), input.raw.track_count, input.raw.x.len());
     let of_job = (solution.views.len(), solution.tracks.inlier.len(), solution.observations.inlier.len());
     if of_file != of_job {
-        let words =
-            |(views, tracks, observations)| format!("{views} views, {tracks} tracks and {observations} observations");
+        let words = |(views, tracks, observations)| {
+            let (views, tracks) = (counted::<usize>(views, "view"), counted::<usize>(tracks, "track"));
+            format!("{views}, {tracks} and {}", counted::<usize>(observations, "observation"))
+        };
         let message = format!("the file has {}, the job's input had {}", words(of_file), words(of_job));
         return Err(Failure { exit: Exit::BadInput, message });
     }

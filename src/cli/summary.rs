@@ -1,7 +1,7 @@
 //! A result in a few lines for people.
 
 use super::next_steps::{self, Files};
-use crate::domain::{Grade, Solution, Status, VERIFIED};
+use crate::domain::{Grade, Solution, Status, VERIFIED, counted};
 use crate::formats::result_json::{CameraGroupJson, SecondStructureCounts, camera_groups};
 use crate::formats::track_counts::TrackCounts;
 use crate::formats::{LabelledInput, result_files, second_structures, warnings};
@@ -25,7 +25,7 @@ pub fn text(solution: &Solution, input: Option<&LabelledInput>) -> String {
                 fact(&format!("camera {} ", camera.camera_group), self::camera(camera));
             }
             if several.len() > MOST_CAMERAS {
-                fact("", format!("and {} more cameras: see result.json", several.len() - MOST_CAMERAS));
+                fact("", format!("and {}: see result.json", counted(several.len() - MOST_CAMERAS, "more camera")));
             }
         }
     }
@@ -37,33 +37,36 @@ pub fn text(solution: &Solution, input: Option<&LabelledInput>) -> String {
     fact(
         "inliers",
         format!(
-            "{} of {} tracks, {} of {observations} observations",
+            "{} of {}, {} of {}",
             tracks.inlier,
-            solution.tracks.inlier.len(),
-            solution.inlier_observation_count()
+            counted(solution.tracks.inlier.len(), "track"),
+            solution.inlier_observation_count(),
+            counted(observations, "observation")
         ),
     );
     if tracks.two_view > 0 {
-        let what = "tracks that two views of a part see are consistent with these; none is verified";
-        fact("two views", format!("{} {what}", tracks.two_view));
+        let what = "that two views of a part see, consistent with these and not verified";
+        fact("two views", format!("{} {what}", counted(tracks.two_view, "track")));
     }
     if let Some(count @ 1..) = tracks.unclassified {
-        let others = if tracks.two_view > 0 { "other tracks" } else { "tracks" };
-        fact("unclassified", format!("{count} {others}: fewer than {VERIFIED} registered views see them"));
+        let others = counted(count, if tracks.two_view > 0 { "other track" } else { "track" });
+        let them = if count == 1 { "it" } else { "them" };
+        fact("unclassified", format!("{others}: fewer than {VERIFIED} registered views see {them}"));
     }
     if let Some(count @ 1..) = tracks.rejected {
         let agreeing =
             if solution.second_structures.is_empty() { "" } else { ", some of which agree on other motions" };
-        fact("rejected", format!("{count} tracks{agreeing}"));
+        fact("rejected", format!("{}{agreeing}", counted(count, "track")));
     }
     if let (Status::Solved, None, count @ 1..) = (solution.status, tracks.rejected, tracks.others) {
-        fact("not counted", format!("{count} tracks, rejected or unclassified: the input tells them apart (--input)"));
+        let others = counted(count, "track");
+        fact("not counted", format!("{others}, rejected or unclassified: the input tells which (--input)"));
     }
     for counts in second_structures::counts(solution) {
         fact(&format!("structure {} ", counts.number), structure(&counts));
     }
     if !solution.splits.is_empty() {
-        fact("splits", format!("{} further points in tracks that join several", solution.splits.len()));
+        fact("splits", format!("{} in tracks that join several", counted(solution.splits.len(), "further point")));
     }
     fact("views", format!("{} of {} registered", solution.registered_views().len(), solution.views.len()));
     if let Some(parts) = parts(solution) {
@@ -77,7 +80,7 @@ pub fn text(solution: &Solution, input: Option<&LabelledInput>) -> String {
     }
     let mut spent = format!("{:.2} s, {}", solution.seconds, solution.method.name());
     if solution.iterations > 0 {
-        spent.push_str(&format!(", {} network iterations", solution.iterations));
+        spent.push_str(&format!(", {}", counted(solution.iterations, "network iteration")));
     }
     if let Some(proposal) = solution.winning_proposal {
         spent.push_str(&format!(", found by the proposal `{}`", proposal.name()));
@@ -134,13 +137,14 @@ fn parts(solution: &Solution) -> Option<String> {
 /// What is known of a second structure.
 fn structure(counts: &SecondStructureCounts) -> String {
     let kind = counts.kind.map_or_else(String::new, |kind| format!(", a {}", second_structures::kind_words(kind)));
-    let poses = if counts.views > 0 { format!("posed in {} views", counts.views) } else { "no poses".to_owned() };
-    format!("{} tracks{kind}, {poses}", counts.tracks)
+    let poses =
+        if counts.views > 0 { format!("posed in {}", counted(counts.views, "view")) } else { "no poses".to_owned() };
+    format!("{}{kind}, {poses}", counted(counts.tracks, "track"))
 }
 
 /// What is known of one camera of several.
 fn camera(camera: &CameraGroupJson) -> String {
-    let views = format!("{} of {} views", camera.registered_views, camera.views);
+    let views = format!("{} of {}", camera.registered_views, counted(camera.views, "view"));
     let Some(focal_px) = camera.focal_px else { return format!("no calibration, {views}") };
     let mut text = format!("{}, {views}", focal(focal_px, camera.sigma_log_focal));
     if let Some(grade) = camera.grade {
@@ -193,7 +197,7 @@ mod tests {
         let outlier = solution.tracks.inlier.iter().position(|inlier| !inlier).expect("an outlier") as u32;
         solution.two_view_tracks = vec![TwoViewTrack { track: outlier, weight: 0.75, part: 0, point: None }];
         let lines = text(&solution, Some(&input));
-        assert!(lines.contains("two views    1 tracks that two views of a part see"), "{lines}");
+        assert!(lines.contains("two views    1 track that two views of a part see"), "{lines}");
         assert!(lines.contains("unclassified 19 other tracks: fewer than 3 registered views see them"), "{lines}");
     }
 
@@ -209,7 +213,7 @@ mod tests {
 
     #[test]
     fn tells_of_tracks_that_join_points() {
-        assert!(text(&fixture::solved_with_a_split().1, None).contains("splits       1 further points"));
+        assert!(text(&fixture::solved_with_a_split().1, None).contains("splits       1 further point in"));
     }
 
     #[test]
@@ -246,10 +250,10 @@ mod tests {
         solution.views[4].camera_group = 9;
         let lines = text(&solution, None);
         assert!(lines.contains("  camera 0     ") && lines.contains("4 of 4 views, METRIC"), "{lines}");
-        assert!(lines.contains("  camera 9     77.0 px +- 0.40 % (one sigma), 1 of 1 views, WEAK"), "{lines}");
+        assert!(lines.contains("  camera 9     77.0 px +- 0.40 % (one sigma), 1 of 1 view, WEAK"), "{lines}");
         solution.views[4].projection = None;
         solution.calibrations.pop();
-        assert!(text(&solution, None).contains("camera 9     no calibration, 0 of 1 views"));
+        assert!(text(&solution, None).contains("camera 9     no calibration, 0 of 1 view"));
     }
 
     #[test]

@@ -6,7 +6,7 @@ use super::exit::{Exit, Failure};
 pub use super::scene_args::SceneArgs;
 use super::scene_args::{CameraArgs, GeometryArgs, OutlierArgs};
 use crate::domain::error::quoted;
-use crate::domain::{ImageSize, RawInput};
+use crate::domain::{ImageSize, RawInput, counted};
 use crate::formats::publish::{create_directory, pretty, write_atomically};
 use crate::formats::result_files::OBSERVATIONS;
 use crate::formats::{observations, view_table};
@@ -159,12 +159,12 @@ pub fn run(args: Args) -> Result<Exit, Failure> {
         write(&args.out, SQUARE, &sequence.input, &sequence.options, &sequence.truth)?;
         let right = sequence.truth.inlier.iter().filter(|&&inlier| inlier).count();
         tell!(
-            "{} views, {} observations, {} tracks of {} to {} views of which {right} are right, {}: {}",
-            args.scene.views,
-            sequence.input.x.len(),
-            args.scene.tracks,
+            "{}, {}, {} of {} to {} of which {right} are right, {}: {}",
+            counted(args.scene.views, "view"),
+            counted(sequence.input.x.len(), "observation"),
+            counted(args.scene.tracks, "track"),
             sequence.options.lifetime.0,
-            sequence.options.lifetime.1,
+            counted(sequence.options.lifetime.1, "view"),
             focal(sequence.truth.focal_px, sequence.options.zoom),
             args.out.display()
         );
@@ -183,11 +183,11 @@ fn photographed(args: &Args) -> Result<Exit, Failure> {
     write(&args.out, IMAGE_SIZE, &scene.input, &scene.options, &scene.truth)?;
     let right = scene.truth.inlier.iter().filter(|&&inlier| inlier).count();
     tell!(
-        "{}: {} views, {} observations, {} tracks of which {right} are right, {}: {}",
+        "{}: {}, {}, {} of which {right} are right, {}: {}",
         options.name(),
-        options.views,
-        scene.input.x.len(),
-        options.tracks,
+        counted(options.views, "view"),
+        counted(scene.input.x.len(), "observation"),
+        counted(options.tracks, "track"),
         focal(options.focal_px, 0.0),
         args.out.display()
     );
@@ -198,7 +198,8 @@ fn photographed(args: &Args) -> Result<Exit, Failure> {
 pub fn describe(scene: &Scene) -> String {
     let right = scene.truth.inlier.iter().filter(|&&inlier| inlier).count();
     let focal = focal(scene.truth.focal_px, scene.options.zoom);
-    format!("{} views, {} tracks of which {right} are right, {focal}", scene.options.views, scene.options.tracks)
+    let (views, tracks) = (counted(scene.options.views, "view"), counted(scene.options.tracks, "track"));
+    format!("{views}, {tracks} of which {right} are right, {focal}")
 }
 
 /// The focal length of a scene in words.

@@ -10,6 +10,7 @@ use indicatif::{ProgressBar, ProgressStyle};
 use super::args::parse_whole;
 use super::exit::{Exit, Failure};
 use super::interrupt::Interrupt;
+use crate::domain::counted;
 use crate::formats::publish::{create_directory, write_atomically};
 use crate::report::chart::{LineChart, Series, standalone};
 use crate::training::{Milestone, Objective, Settings, Trainer};
@@ -223,8 +224,9 @@ impl View {
         let Milestone { step, scenes, loss, parts: [first, second], precision } = milestone;
         let [first_name, second_name] = self.objective.parts();
         let line = format!(
-            "step {step}, {scenes} scenes: loss {loss:.4} ({first_name} {first:.4}, {second_name} {second:.4}), average \
-             precision {precision:.4}"
+            "step {step}, {}: loss {loss:.4} ({first_name} {first:.4}, {second_name} {second:.4}), average \
+             precision {precision:.4}",
+            counted(*scenes, "scene")
         );
         self.bar.set_message(format!("AP {precision:.4}"));
         self.note(&line);

@@ -5,7 +5,7 @@ use std::ops::Range;
 use serde::Serialize;
 
 use super::{Label, LabelledInput, warnings};
-use crate::domain::{Grade, RawInput, Solution, Status};
+use crate::domain::{Grade, RawInput, Solution, Status, counted};
 
 /// Names of the files.
 pub const CSV: &str = "windows.csv";
@@ -237,7 +237,7 @@ impl Table {
             let of = |average: &Option<Average>| average.as_ref().map(pick);
             format!(
                 "{name:>6}  {:<24}{:>8}{:>8}{:>8}{:>10}{:>9}  {:<18}{:>8}{:>9}\n",
-                format!("{} of {} windows solved", self.solved, self.windows.len()),
+                format!("{} of {} solved", self.solved, counted(self.windows.len(), "window")),
                 "",
                 shown(of(&self.inlier_tracks), 1.0, 1),
                 "",

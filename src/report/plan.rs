@@ -5,6 +5,7 @@ use std::fmt::Write;
 use nalgebra::{Vector2, Vector3};
 
 use super::space::{Camera, Part};
+use crate::domain::counted;
 
 const WIDTH: f64 = 460.0;
 const HEIGHT: f64 = 300.0;
@@ -94,17 +95,16 @@ pub fn svg(part: &Part) -> String {
     let outside = points.iter().filter(|at| !drawn(at)).count();
     let share = (100.0 * outside as f64 / points.len().max(1) as f64).max(1.0);
     let outside = if outside > 0 { format!(" ({share:.0} % outside)") } else { String::new() };
+    let of_points = counted(part.all_points, "point");
     let mut svg = format!(
-        "<svg class=\"plan\" viewBox=\"0 0 {WIDTH} {HEIGHT}\" role=\"img\" aria-label=\"part {} {}: {} cameras, {} points\">\
-         <text class=\"title\" x=\"8\" y=\"18\">Part {} {}: {} views, {} points{outside}</text>",
+        "<svg class=\"plan\" viewBox=\"0 0 {WIDTH} {HEIGHT}\" role=\"img\" aria-label=\"part {} {}: {}, {of_points}\">\
+         <text class=\"title\" x=\"8\" y=\"18\">Part {} {}: {}, {of_points}{outside}</text>",
         part.part,
         look.words,
-        part.cameras.len(),
-        part.all_points,
+        counted(part.cameras.len(), "camera"),
         part.part,
         look.words,
-        part.cameras.len(),
-        part.all_points
+        counted(part.cameras.len(), "view")
     );
     if !scale.is_finite() {
         return svg + "</svg>";

@@ -8,7 +8,7 @@ use super::counts::ViewCount;
 use super::html::{script_json, short};
 use super::labels;
 use super::pack::{Packed, quantised, residual_code};
-use crate::domain::Solution;
+use crate::domain::{Solution, counted};
 use crate::formats::LabelledInput;
 
 /// Observations in the page, 11 bytes each: 1.3 MB. More than a canvas of 900 px shows apart.
@@ -55,11 +55,11 @@ pub fn section(solution: &Solution, input: Option<&LabelledInput>, counts: &[Vie
          <canvas id=\"image\" tabindex=\"0\" role=\"img\" aria-label=\"tracks of the chosen view; left and right arrow: other views\"></canvas>\n\
          <p class=\"note\" id=\"legend\"></p>\n\
          <p class=\"note\" id=\"hover\">Point at an observation to see its track.</p>\n\
-         <table id=\"worst\"></table>\n<p class=\"note\">{} of {} tracks are drawn; the figures are of all.{}</p>\n\
+         <table id=\"worst\"></table>\n<p class=\"note\">{} of {} are drawn; the figures are of all.{}</p>\n\
          <noscript><p class=\"note\">The picture needs the page's own script; the figures of the views stand in the table below.</p></noscript>\n\
          <script type=\"application/json\" id=\"tracks-data\">{}</script>\n</section>\n",
         tracks.shown,
-        tracks.all,
+        counted(tracks.all, "track"),
         if tracks.named { "" } else { " Their names are too long for this page: they are numbered from 0." },
         script_json(&tracks.json)
     );

@@ -6,7 +6,7 @@ use super::chart::{self, LineChart, Series};
 use super::html::{escape, short};
 use super::words;
 use crate::domain::result::ProposalTime;
-use crate::domain::{Calibration, Grade, HeadProgress, LensProjection, Losses, Progress, Solution, Status};
+use crate::domain::{Calibration, Grade, HeadProgress, LensProjection, Losses, Progress, Solution, Status, counted};
 use crate::formats::LabelledInput;
 use crate::formats::track_counts::TrackCounts;
 use crate::formats::warnings::named;
@@ -51,7 +51,7 @@ pub fn headline(solution: &Solution, input: Option<&LabelledInput>) -> String {
     card(
         "inlier tracks",
         format!("{} of {}", tracks.inlier, solution.tracks.inlier.len()),
-        format!("{} of {observations} observations", solution.inlier_observation_count()),
+        format!("{} of {}", solution.inlier_observation_count(), counted(observations, "observation")),
     );
     if let (Some(rejected), Some(unclassified)) = (tracks.rejected, tracks.unclassified) {
         let others =
@@ -71,7 +71,11 @@ pub fn headline(solution: &Solution, input: Option<&LabelledInput>) -> String {
     let proposal = solution
         .winning_proposal
         .map_or_else(String::new, |proposal| format!(", found by the proposal {}", proposal.name()));
-    card("method", solution.method.name().into(), format!("{} network iterations{proposal}", solution.iterations));
+    card(
+        "method",
+        solution.method.name().into(),
+        format!("{}{proposal}", counted(solution.iterations, "network iteration")),
+    );
     card("time", format!("{:.2} s", solution.seconds), stage_times(solution));
     html.push_str("</dl>\n</header>\n");
     html
@@ -274,9 +278,9 @@ fn proposal_times(solution: &Solution) -> String {
     }
     let sentence = |time: &ProposalTime| {
         let when = match time.seconds {
-            Some(seconds) => format!("{seconds:.2} s ({} steps)", time.steps),
+            Some(seconds) => format!("{seconds:.2} s ({})", counted(time.steps, "step")),
             None if time.steps == 0 => "not asked".to_owned(),
-            None => format!("never ({} steps)", time.steps),
+            None => format!("never ({})", counted(time.steps, "step")),
         };
         format!("{} {when}", time.proposal.name())
     };

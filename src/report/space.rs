@@ -8,7 +8,7 @@ use serde_json::{Value, json};
 use super::html::script_json;
 use super::pack::Packed;
 use super::{counts, labels, plan};
-use crate::domain::{Grade, Solution};
+use crate::domain::{Grade, Solution, counted};
 use crate::formats::LabelledInput;
 use crate::formats::cameras_json::CamerasJson;
 
@@ -143,10 +143,10 @@ pub fn section(solution: &Solution, input: Option<&LabelledInput>) -> String {
         for (index, part) in parts.iter().enumerate() {
             let _ = write!(
                 html,
-                "<option value=\"{index}\">{} ({} views, {} points)</option>",
+                "<option value=\"{index}\">{} ({}, {})</option>",
                 part.part,
-                part.cameras.len(),
-                part.all_points
+                counted(part.cameras.len(), "view"),
+                counted(part.all_points, "point")
             );
         }
         html.push_str("</select></label></p>\n");
@@ -160,11 +160,14 @@ pub fn section(solution: &Solution, input: Option<&LabelledInput>) -> String {
     };
     let _ = write!(
         html,
-        "<canvas id=\"solid\" tabindex=\"0\" role=\"img\" aria-label=\"{cameras} cameras and {all} points in space; arrows turn, \
+        "<canvas id=\"solid\" tabindex=\"0\" role=\"img\" aria-label=\"{} and {} in space; arrows turn, \
          shift and arrows move, plus and minus zoom, 0 goes back\"></canvas>\n\
          <p class=\"note\">Drag or arrows to turn, wheel, pinch or + and - to zoom, shift-drag, two fingers or shift and arrows to \
          move, double click or 0 to go back. Points are coloured by weight, from orange (0) to blue (1); cameras by part. \
-         {shown} of {all} points are drawn.{further}</p>\n"
+         {shown} of {} are drawn.{further}</p>\n",
+        counted(cameras, "camera"),
+        counted(all, "point"),
+        counted(all, "point")
     );
     html.push_str("<div class=\"grid\" id=\"plans\">\n");
     for part in parts.iter().take(MAX_PLANS) {

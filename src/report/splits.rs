@@ -5,7 +5,7 @@ use std::fmt::Write;
 
 use super::html::{escape, short};
 use super::labels;
-use crate::domain::Solution;
+use crate::domain::{Solution, counted};
 use crate::formats::LabelledInput;
 
 /// Tracks listed; observations.csv has them all.
@@ -25,12 +25,12 @@ pub fn section(solution: &Solution, input: Option<&LabelledInput>) -> String {
     }
     let seen = seen(solution, input, &tracks);
     let mut html = format!(
-        "<section id=\"splits\">\n<h2>Tracks that join several points</h2>\n<p>Wrong links join {} further points to {} tracks. \
+        "<section id=\"splits\">\n<h2>Tracks that join several points</h2>\n<p>Wrong links join {} to {}. \
          Each is a point of its own here and in the exports, with the observations that show it.</p>\n\
          <div class=\"table\"><table>\n<tr><th>track</th><th>point</th><th>weight</th><th>observations</th><th>first view</th>\
          <th>last view</th></tr>\n",
-        solution.splits.len(),
-        tracks.len()
+        counted(solution.splits.len(), "further point"),
+        counted(tracks.len(), "track")
     );
     for &track in tracks.iter().take(MAX_TRACKS) {
         let weight = solution.tracks.weight.get(track as usize).copied().unwrap_or(0.0);

@@ -17,7 +17,7 @@ use serde_json::Value;
 
 use super::Error;
 use crate::domain::error::quoted;
-use crate::domain::{ImageSize, Limits};
+use crate::domain::{ImageSize, Limits, counted};
 use crate::formats::{self, LabelledInput, Reading};
 
 pub const OBSERVATIONS: &str = "observations.csv";
@@ -112,8 +112,8 @@ impl Sequence {
         if self.centres.is_empty() || (self.centres.len() as u64) > last {
             return Ok(());
         }
-        let what =
-            format!("has {} entries, but {OBSERVATIONS} has a view {last}: one a view is needed", self.centres.len());
+        let entries = counted(self.centres.len(), "entry");
+        let what = format!("has {entries}, but {OBSERVATIONS} has a view {last}: one a view is needed");
         Err(Error::place(&self.directory.join(CAMERAS), "`P`", what))
     }
 }

@@ -12,6 +12,7 @@ use serde::de::DeserializeOwned;
 
 use super::Sequence;
 use super::measures::{Answer, Verdicts};
+use crate::domain::counted;
 use crate::formats::result_files::{CAMERAS, OBSERVATIONS, RESULT};
 
 /// The solve of a sequence; its files go to [`files`] of `scratch`.
@@ -76,7 +77,11 @@ pub fn answer(sequence: &Sequence, scratch: &Path, status: ExitStatus, complaint
     let cameras: CamerasFile = json(&directory.join(CAMERAS))?;
     let inlier = verdicts(&directory.join(OBSERVATIONS))?;
     if inlier.len() != sequence.inlier.len() {
-        return Err(format!("{OBSERVATIONS} has {} verdicts for {} observations", inlier.len(), sequence.inlier.len()));
+        return Err(format!(
+            "{OBSERVATIONS} has {} for {}",
+            counted(inlier.len(), "verdict"),
+            counted(sequence.inlier.len(), "observation")
+        ));
     }
     Ok(Answer {
         registered: result.registered_views,

@@ -18,7 +18,7 @@ use serde_json::Value;
 
 use super::Sequence;
 use super::measures::{Answer, Verdicts};
-use crate::domain::ImageSize;
+use crate::domain::{ImageSize, counted};
 
 /// Bytes of an answer: verdicts and centres of the largest input take less than half.
 const MOST_BYTES: u64 = 1 << 28;
@@ -140,18 +140,17 @@ fn spread(sequence: &Sequence, said: &PeerFile) -> Result<(Vec<bool>, Verdicts),
     if let Some(verdicts) = &said.observation_inlier {
         if verdicts.len() != observations {
             let what = "`observation_inlier` has";
-            return Err(format!("its answer's {what} {} entries for {observations} observations", verdicts.len()));
+            let (entries, due) = (counted(verdicts.len(), "entry"), counted(observations, "observation"));
+            return Err(format!("its answer's {what} {entries} for {due}"));
         }
         return Ok((verdicts.iter().map(Verdict::holds).collect(), Verdicts::Observations));
     }
     let tracks = said.inlier.as_ref().ok_or("its answer has neither `inlier` nor `observation_inlier`")?;
     let verdict = |k: usize| {
         let (_, track) = sequence.ids(k);
-        usize::try_from(track)
-            .ok()
-            .and_then(|track| tracks.get(track))
-            .map(Verdict::holds)
-            .ok_or_else(|| format!("its answer's `inlier` has {} entries, none for track {track}", tracks.len()))
+        usize::try_from(track).ok().and_then(|track| tracks.get(track)).map(Verdict::holds).ok_or_else(|| {
+            format!("its answer's `inlier` has {}, none for track {track}", counted(tracks.len(), "entry"))
+        })
     };
     Ok(((0..observations).map(verdict).collect::<Result<_, _>>()?, Verdicts::Tracks))
 }

@@ -165,7 +165,7 @@ fn a_peer_that_fails_is_a_row_with_its_reason() {
         ("echo '{' > \"$5\"", patient, "cannot be read"),
         ("echo '{\"views\": 3}' > \"$5\"", patient, "neither `inlier` nor `observation_inlier`"),
         ("echo '{\"views\": 3, \"inlier\": [1, 0]}' > \"$5\"", patient, "2 entries"),
-        ("echo '{\"views\": 3, \"observation_inlier\": [1]}' > \"$5\"", patient, "1 entries"),
+        ("echo '{\"views\": 3, \"observation_inlier\": [1]}' > \"$5\"", patient, "1 entry"),
         ("sleep 600", Duration::from_millis(50), "its limit"),
     ];
     for (script, timeout, expected) in cases {
@@ -210,7 +210,7 @@ fn what_is_wrong_with_a_folder_names_file_and_place() {
         (folder::LABELS, line(7, &second), "line 7: view"),
         (folder::LABELS, line(2, ""), "says nothing of view"),
         (folder::CAMERAS, "{}".into(), "`P`: must be a list"),
-        (folder::CAMERAS, json!({"P": [null]}).to_string(), "`P`: has 1 entries"),
+        (folder::CAMERAS, json!({"P": [null]}).to_string(), "`P`: has 1 entry"),
         (folder::CAMERAS, json!({"P": [null, [[0, 0, 0, 1], [0, 0, 0, 1], [0, 0, 0, 1]]]}).to_string(), "`P[1]`"),
         (folder::OBSERVATIONS, "view,track,x\n".into(), "no column `y`"),
     ];

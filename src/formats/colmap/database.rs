@@ -14,7 +14,7 @@ use self::rows::Keypoints;
 pub(super) use self::rows::MAX_MATCHES;
 use super::images::{Images, Observation};
 use crate::domain::matches::{keypoint_starts, view_of};
-use crate::domain::{Limits, PairMatches};
+use crate::domain::{Limits, PairMatches, counted};
 use crate::formats::error::{Error, Problem};
 use crate::formats::input::{LabelledInput, display_path};
 use crate::formats::source::Matches;
@@ -66,20 +66,18 @@ impl Contents {
         let joined = matches.join(&starts);
         if joined.observations.len() > limits.max_observations {
             let what = format!(
-                "{} observations are above the limit of {}",
-                joined.observations.len(),
+                "{} are above the limit of {}",
+                counted(joined.observations.len(), "observation"),
                 limits.max_observations
             );
             return Err(Problem::of_file(what));
         }
         let note = format!(
-            "{} tracks were joined from {} {} matches of {} image pairs; {} matches were cut, which would have put two \
-             keypoints of one image into one track",
-            joined.tracks,
-            matches.len(),
-            kind_name(self.kind),
-            matches.pair_count(),
-            joined.cut
+            "joined {} of {} into {}; cut {}, which would have put two keypoints of one image into one track",
+            counted(matches.len(), &format!("{} match", kind_name(self.kind))),
+            counted(matches.pair_count(), "image pair"),
+            counted(joined.tracks, "track"),
+            counted(joined.cut, "match")
         );
         let observation = |&(keypoint, track): &(u32, u32)| {
             let view = view_of(&starts, keypoint);

@@ -130,8 +130,8 @@ fn matches_become_tracks_of_images_by_name_in_our_pixels() {
     assert_eq!(
         input.notes,
         [
-            "2 tracks were joined from 4 verified matches of 2 image pairs; 0 matches were cut, which would have put two \
-          keypoints of one image into one track"
+            "joined 4 verified matches of 2 image pairs into 2 tracks; cut 0 matches, which would have put two keypoints \
+             of one image into one track"
         ]
     );
 }
@@ -170,7 +170,7 @@ fn a_wrong_match_is_cut_and_counted() {
     let (_directory, path) = with_matches("matches", &wrong);
     let input = read(&path, &Limits::default(), None).expect("valid");
     assert_eq!(input.raw.track, [0, 0, 0, 1, 1, 1]);
-    assert!(input.notes[0].contains("from 7 raw") && input.notes[0].contains("; 1 matches were cut"));
+    assert!(input.notes[0].starts_with("joined 7 raw matches of ") && input.notes[0].contains("; cut 1 match, "));
 }
 
 #[test]

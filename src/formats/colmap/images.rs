@@ -5,7 +5,7 @@ use std::path::Path;
 
 use super::FIRST_PIXEL;
 use super::cameras::Camera;
-use crate::domain::{RawInput, View};
+use crate::domain::{RawInput, View, counted};
 use crate::formats::input::LabelledInput;
 use crate::formats::label::{Label, dense};
 
@@ -136,7 +136,8 @@ impl Images {
         let mut notes = notes;
         let repeated = drop_repeated(&mut observations);
         if repeated > 0 {
-            notes.push(format!("{repeated} observations were left out, each the second of a track in one image"));
+            let left_out = counted(repeated, "observation");
+            notes.push(format!("left out {left_out} beyond the first of a track in one image"));
         }
         notes.extend(self.foreign_cameras());
         let (view_of, order) = self.views();
@@ -260,7 +261,7 @@ mod tests {
         assert_eq!((view.camera_group, view.size.map(|size| size.width_px)), (2, Some(320)));
         assert_eq!(view.focal_prior.map(|prior| prior.focal_px), Some(500.0));
         assert_eq!(input.notes.len(), 1, "{:?}", input.notes);
-        assert!(input.notes[0].starts_with("1 observations were left out"));
+        assert!(input.notes[0].starts_with("left out 1 observation beyond"));
         input.check(&Limits::default()).expect("valid");
     }
 }

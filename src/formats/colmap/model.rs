@@ -12,7 +12,7 @@ use std::io::BufReader;
 use std::path::Path;
 
 use super::images::{Images, Observation};
-use crate::domain::Limits;
+use crate::domain::{Limits, counted};
 use crate::formats::error::{Error, Problem};
 use crate::formats::input::{LabelledInput, display_path};
 
@@ -67,7 +67,7 @@ fn into_labelled(
     limits: &Limits,
 ) -> Result<LabelledInput, Error> {
     if observations.is_empty() {
-        let what = format!("has {} images, and no keypoint of a point in space", images.len());
+        let what = format!("has {}, and no keypoint of a point in space", counted(images.len(), "image"));
         return Err(Error::whole(&display_path(path), what));
     }
     // Lines are those of the images.

@@ -87,7 +87,7 @@ fn the_right_tracks_come_back_as_verified_matches_and_the_cameras_as_known() {
     };
     assert_eq!(seen(&again, &|_| true), seen(&case.input, &|k| case.solution.observations.inlier[k]));
     assert_eq!(again.raw.track_count, case.solution.inlier_track_count());
-    assert!(again.notes[0].contains("; 0 matches were cut"), "{:?}", again.notes);
+    assert!(again.notes[0].contains("; cut 0 matches, "), "{:?}", again.notes);
     let focal_px = case.solution.calibrations[0].focal_px;
     assert!(again.raw.views.iter().all(|view| view.focal_prior.is_some_and(|prior| prior.focal_px == focal_px)));
     // k1 goes into the model that the camera had.

@@ -6,6 +6,7 @@ use serde::{Deserialize, Serialize};
 
 use super::result::ViewResult;
 use super::warning::{Warning, WarningCode};
+use super::words::counted;
 
 /// Views named one by one in a warning; past these they are only counted.
 const MOST_LISTED: usize = 20;
@@ -58,7 +59,7 @@ impl fmt::Display for LeftOut {
             LeftOut::OutsideBlock => f.write_str("is outside the block that was solved"),
             LeftOut::NotRegistered { points: 0, .. } => f.write_str("sees too few points of the reconstruction"),
             LeftOut::NotRegistered { points, agreeing } => {
-                write!(f, "{agreeing} of the {points} points it sees agree on a pose")
+                write!(f, "{agreeing} of the {} it sees agree on a pose", counted(*points, "point"))
             }
             LeftOut::Unknown => f.write_str("for a reason that this version does not know"),
         }

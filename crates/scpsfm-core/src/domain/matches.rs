@@ -8,6 +8,7 @@ use super::error::{InvalidInput, Violation, Violations};
 use super::input::{Input, RawInput, View, check_position, too_few_views};
 use super::joining::{self, Joined, Match};
 use super::limits::Limits;
+use super::words::counted;
 
 /// Matches of pairs of views. Structure of arrays: one entry a pair, and one entry a match, pair after pair.
 #[derive(Debug, Clone, Default, PartialEq, Eq)]
@@ -138,7 +139,7 @@ impl RawMatches {
         let match_count = self.pairs.len() as u32;
         let Joined { observations, tracks, cut } = self.pairs.join(&starts);
         if tracks > limits.max_tracks {
-            let what = format!("joined into {tracks} tracks, above the limit of {}", limits.max_tracks);
+            let what = format!("joined into {}, above the limit of {}", counted(tracks, "track"), limits.max_tracks);
             return Err(Violation::of(field("first_keypoint_indices"), what).into());
         }
         let mut raw = RawInput { views: self.views, track_count: tracks, ..RawInput::default() };
@@ -191,7 +192,7 @@ impl RawMatches {
         ];
         for (name, length, due, what) in lengths {
             if length as u64 != due {
-                found.push(Violation::of(field(name), format!("has {length} entries for {due} {what}")));
+                found.push(Violation::of(field(name), format!("has {} for {due} {what}", counted(length, "entry"))));
             }
         }
         found.into_result()
@@ -243,7 +244,8 @@ impl RawMatches {
         for ((name, keypoints), view) in sides.into_iter().zip(views) {
             let count = self.keypoint_counts[view as usize];
             for k in range.clone().filter(|&k| keypoints[k] >= count) {
-                let what = format!("keypoint {} is outside the {count} keypoints of view {view}", keypoints[k]);
+                let what =
+                    format!("keypoint {} is outside the {} of view {view}", keypoints[k], counted(count, "keypoint"));
                 found.push(Violation::at(field(name), k, what));
             }
         }

@@ -18,6 +18,7 @@ pub mod second_structure;
 pub mod settings;
 pub mod stop;
 pub mod warning;
+pub mod words;
 
 pub use digest::Sha256Digest;
 pub use error::{InvalidInput, Violation};
@@ -32,3 +33,4 @@ pub use result::{Calibration, Grade, LensProjection, Proposal, Solution, Status,
 pub use settings::{Backend, Method, SolveSettings};
 pub use stop::{StopReason, StopToken};
 pub use warning::{Warning, WarningCode};
+pub use words::counted;

@@ -5,6 +5,7 @@ use std::collections::HashMap;
 use super::{FocalPrior, ImageSize, Input, RawInput, View};
 use crate::domain::error::{Violation, Violations, quoted};
 use crate::domain::limits::Limits;
+use crate::domain::words::counted;
 
 pub(super) fn check_counts(raw: &RawInput, limits: &Limits, field: &impl Fn(&str) -> String, found: &mut Violations) {
     let mut bound = |name: &str, count: usize, max: usize, what: &str| {
@@ -29,7 +30,11 @@ pub(super) fn check_counts(raw: &RawInput, limits: &Limits, field: &impl Fn(&str
         if length != raw.x.len() {
             found.push(Violation::of(
                 field(name),
-                format!("has {length} entries where xs has {}; all must have one an observation", raw.x.len()),
+                format!(
+                    "has {} where xs has {}; all must have one an observation",
+                    counted(length, "entry"),
+                    raw.x.len()
+                ),
             ));
         }
     }
@@ -37,7 +42,11 @@ pub(super) fn check_counts(raw: &RawInput, limits: &Limits, field: &impl Fn(&str
         if !values.is_empty() && values.len() != raw.x.len() {
             found.push(Violation::of(
                 field(name),
-                format!("has {} entries where xs has {}; give one an observation or none", values.len(), raw.x.len()),
+                format!(
+                    "has {} where xs has {}; give one an observation or none",
+                    counted(values.len(), "entry"),
+                    raw.x.len()
+                ),
             ));
         }
     }
