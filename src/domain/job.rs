@@ -8,8 +8,8 @@ use serde::{Deserialize, Serialize};
 
 use super::input_name::InputName;
 use super::progress::Progress;
-use super::result::{Grade, Proposal, Status};
-use super::settings::SolveSettings;
+use super::result::{Grade, Status};
+use super::settings::{Proposal, SolveSettings};
 use super::warning::Warning;
 use super::webhook::Webhook;
 

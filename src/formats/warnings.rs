@@ -3,13 +3,13 @@
 use super::LabelledInput;
 use super::result_json::{track_label, view_label};
 use crate::domain::duplicates::Duplicates;
-use crate::domain::{Limits, Solution, Warning, WarningCode, left_out};
+use crate::domain::{Limits, Solution, Warning, WarningCode};
 
 /// The warnings of a result, views and tracks under the input's own ids or names; without the input, as the solver gave
 /// them.
 pub fn named(solution: &Solution, input: Option<&LabelledInput>) -> Vec<Warning> {
     let Some(input) = input else { return solution.warnings.clone() };
-    let told = left_out::warnings(&solution.views, |view| view_label(solution, Some(input), view).shown());
+    let told = solution.left_out_warnings(|view| view_label(solution, Some(input), view).shown());
     let mut warnings: Vec<Warning> = solution.warnings.clone();
     if !told.is_empty() {
         warnings.retain(|warning| warning.code != WarningCode::ViewsLeftOut);
@@ -43,7 +43,8 @@ mod tests {
         assert_eq!(named(&solution, Some(&input)), solution.warnings, "nothing is left out");
         solution.views[1] = fixture::left_out(LeftOut::NoObservations);
         solution.views[3] = fixture::left_out(LeftOut::NotRegistered { points: 12, agreeing: 4 });
-        solution.warnings.extend(left_out::warnings(&solution.views, |view| view.to_string()));
+        let left_out = solution.left_out_warnings(|view| view.to_string());
+        solution.warnings.extend(left_out);
         input.view_labels[1] = Label::Name("west.jpg".into());
         let details = |input| -> Vec<String> {
             named(&solution, input).into_iter().skip(1).map(|warning| warning.detail).collect()

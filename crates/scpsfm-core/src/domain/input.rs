@@ -7,8 +7,8 @@ use serde::{Deserialize, Serialize};
 pub(in crate::domain) use self::checks::check_position;
 pub use self::checks::too_few_views;
 use super::error::{InvalidInput, Violations, quoted};
+use super::joined_tracks::{JoinedTracks, Joining};
 use super::limits::Limits;
-use super::matches::{JoinedTracks, Joining};
 
 /// Width and height of an image in pixels.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]

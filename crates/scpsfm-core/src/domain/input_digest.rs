@@ -2,7 +2,8 @@
 
 use sha2::{Digest, Sha256};
 
-use super::{RawInput, Sha256Digest};
+use super::digest::Sha256Digest;
+use super::input::RawInput;
 
 impl RawInput {
     /// SHA-256 of what the whole input says, observations in the caller's order, as the API's

@@ -4,7 +4,6 @@ use std::fmt;
 
 use serde::{Deserialize, Serialize};
 
-use super::result::ViewResult;
 use super::warning::{Warning, WarningCode};
 use super::words::counted;
 
@@ -66,16 +65,19 @@ impl fmt::Display for LeftOut {
     }
 }
 
-/// The warnings that the reasons of the views amount to, one a kind of reason; `name` names a view by its index.
-pub fn warnings(views: &[ViewResult], name: impl Fn(usize) -> String) -> Vec<Warning> {
+/// The warnings that the reasons of the views amount to, one a kind of reason.
+///
+/// * `reasons`: of each view; `None` where it takes part
+/// * `name`: of a view, by its index
+pub fn warnings(reasons: &[Option<LeftOut>], name: impl Fn(usize) -> String) -> Vec<Warning> {
     let of = |wanted: fn(LeftOut) -> bool| -> Vec<(usize, LeftOut)> {
-        let reasons = views.iter().enumerate().filter_map(|(view, result)| Some((view, result.left_out?)));
-        reasons.filter(|(_, reason)| wanted(*reason)).collect()
+        let left_out = reasons.iter().enumerate().filter_map(|(view, reason)| Some((view, (*reason)?)));
+        left_out.filter(|(_, reason)| wanted(*reason)).collect()
     };
     let unregistered = of(|reason| matches!(reason, LeftOut::NotRegistered { .. } | LeftOut::Unknown));
     let outside = of(|reason| reason == LeftOut::OutsideBlock);
     let empty = of(|reason| reason == LeftOut::NoObservations);
-    let observed = views.len() - empty.len();
+    let observed = reasons.len() - empty.len();
     let names = |left: &[(usize, LeftOut)], most| listed(left.iter().map(|(view, _)| name(*view)), most);
     let mut details = Vec::new();
     if !unregistered.is_empty() {
@@ -102,7 +104,7 @@ pub fn warnings(views: &[ViewResult], name: impl Fn(usize) -> String) -> Vec<War
         details.push(format!(
             "nothing is observed in {} of {} views: {}",
             empty.len(),
-            views.len(),
+            reasons.len(),
             names(&empty, MOST_LISTED_EMPTY)
         ));
     }
@@ -123,17 +125,13 @@ fn listed(names: impl ExactSizeIterator<Item = String>, most: usize) -> String {
 mod tests {
     use super::*;
 
-    fn views(reasons: &[Option<LeftOut>]) -> Vec<ViewResult> {
-        reasons.iter().map(|&left_out| ViewResult { left_out, ..ViewResult::default() }).collect()
-    }
-
     #[test]
     fn every_kind_of_reason_is_told_once_with_names() {
         let unseen = LeftOut::NotRegistered { points: 0, agreeing: 0 };
         let lost = LeftOut::NotRegistered { points: 12, agreeing: 4 };
         let empty = Some(LeftOut::NoObservations);
-        let views = views(&[None, Some(lost), empty, Some(unseen), empty, empty, empty, empty, empty]);
-        let told = warnings(&views, |view| format!("{view}.jpg"));
+        let reasons = [None, Some(lost), empty, Some(unseen), empty, empty, empty, empty, empty];
+        let told = warnings(&reasons, |view| format!("{view}.jpg"));
         assert!(told.iter().all(|warning| warning.code == WarningCode::ViewsLeftOut));
         let details: Vec<&str> = told.iter().map(|warning| warning.detail.as_str()).collect();
         assert_eq!(
@@ -150,7 +148,7 @@ mod tests {
     fn views_that_many_points_contradict_may_be_of_another_camera() {
         let views = |count: usize, points: u32| {
             let reason = LeftOut::NotRegistered { points, agreeing: 10 };
-            warnings(&views(&vec![Some(reason); count]), |view| view.to_string())[0].detail.clone()
+            warnings(&vec![Some(reason); count], |view| view.to_string())[0].detail.clone()
         };
         assert!(views(3, 70).ends_with("may be of another camera or zoom"), "{}", views(3, 70));
         assert!(!views(2, 70).contains("another camera") && !views(3, 28).contains("another camera"));
@@ -158,10 +156,10 @@ mod tests {
 
     #[test]
     fn a_block_lists_what_it_leaves_out_and_no_reason_tells_nothing() {
-        let views = views(&[None, Some(LeftOut::OutsideBlock)]);
-        let told = warnings(&views, |view| view.to_string());
+        let reasons = [None, Some(LeftOut::OutsideBlock)];
+        let told = warnings(&reasons, |view| view.to_string());
         assert_eq!(told.len(), 1);
         assert_eq!(told[0].detail, "1 of 2 views are outside the block that was solved and were left out: 1");
-        assert!(warnings(&views[..1], |view| view.to_string()).is_empty());
+        assert!(warnings(&reasons[..1], |view| view.to_string()).is_empty());
     }
 }

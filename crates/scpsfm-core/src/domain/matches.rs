@@ -2,10 +2,9 @@
 
 use std::collections::HashMap;
 
-use serde::{Deserialize, Serialize};
-
 use super::error::{InvalidInput, Violation, Violations};
 use super::input::{Input, RawInput, View, check_position, too_few_views};
+use super::joined_tracks::Joining;
 use super::joining::{self, Joined, Match};
 use super::limits::Limits;
 use super::words::counted;
@@ -105,24 +104,6 @@ pub struct RawMatches {
     pub x: Vec<f64>,
     pub y: Vec<f64>,
     pub pairs: PairMatches,
-}
-
-/// How an input was joined from matches.
-#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
-pub struct Joining {
-    /// Keypoint of each observation in the caller's order, counted within its view.
-    pub keypoint: Vec<u32>,
-    pub match_count: u32,
-    /// Matches that were cut: they would have put two keypoints of one view into one track.
-    pub cut_match_count: u32,
-}
-
-/// The observations of an input that was joined from matches, and how they came about.
-#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
-pub struct JoinedTracks {
-    pub view: Vec<u32>,
-    pub track: Vec<u32>,
-    pub joining: Joining,
 }
 
 impl RawMatches {

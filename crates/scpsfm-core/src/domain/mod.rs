@@ -8,6 +8,7 @@ pub mod duplicates;
 pub mod error;
 pub mod input;
 mod input_digest;
+pub mod joined_tracks;
 pub mod joining;
 pub mod left_out;
 pub mod limits;
@@ -23,14 +24,15 @@ pub mod words;
 pub use digest::Sha256Digest;
 pub use error::{InvalidInput, Violation};
 pub use input::{FocalPrior, ImageSize, Input, RawInput, View};
+pub use joined_tracks::{JoinedTracks, Joining};
 pub use left_out::LeftOut;
 pub use limits::Limits;
-pub use matches::{JoinedTracks, Joining, PairMatches, RawMatches};
+pub use matches::{PairMatches, RawMatches};
 pub use progress::{
     HeadProgress, Losses, Observer, Phase, Progress, ReconstructionProgress, Silent, Stage, Step, Task,
 };
-pub use result::{Calibration, Grade, LensProjection, Proposal, Solution, Status, VERIFIED};
-pub use settings::{Backend, Method, SolveSettings};
+pub use result::{Calibration, Grade, LensProjection, Solution, Status, VERIFIED};
+pub use settings::{Backend, Method, Proposal, SolveSettings};
 pub use stop::{StopReason, StopToken};
 pub use warning::{Warning, WarningCode};
 pub use words::counted;

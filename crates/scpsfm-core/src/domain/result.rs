@@ -5,11 +5,11 @@ use std::collections::BTreeSet;
 use serde::{Deserialize, Serialize};
 
 use super::digest::Sha256Digest;
-use super::left_out::LeftOut;
-use super::matches::JoinedTracks;
+use super::joined_tracks::JoinedTracks;
+use super::left_out::{self, LeftOut};
 use super::progress::{Progress, Stage};
 use super::second_structure::SecondStructure;
-use super::settings::Method;
+use super::settings::{Method, Proposal};
 use super::warning::Warning;
 
 /// Observations from which on a track may be verified: two make a point, and one more verifies it.
@@ -58,48 +58,6 @@ impl Grade {
     /// Whether it promises no less.
     pub fn is_no_worse_than(self, other: Self) -> bool {
         self.worse(other) == other
-    }
-}
-
-/// What proposed the tracks that the accepted hypothesis was sampled from.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Serialize, Deserialize)]
-#[serde(rename_all = "SCREAMING_SNAKE_CASE")]
-pub enum Proposal {
-    /// The weights of the network that is optimised on the request.
-    Network,
-    /// Iteratively reweighted least squares on the subspace.
-    Irls,
-    /// Agreement of a track's motion over the views.
-    Consistency,
-    /// Distances between tracks that stay the same in all views; where depths are given.
-    Rigidity,
-    /// The network that was trained beforehand, see `scpsfm train-prior`.
-    Learned,
-    /// None: uniform sampling.
-    Uniform,
-}
-
-impl Proposal {
-    /// Every proposal.
-    pub const ALL: [Proposal; 6] = [
-        Proposal::Learned,
-        Proposal::Network,
-        Proposal::Irls,
-        Proposal::Consistency,
-        Proposal::Rigidity,
-        Proposal::Uniform,
-    ];
-
-    /// The proposal's name in files, metrics and logs.
-    pub fn name(self) -> &'static str {
-        match self {
-            Proposal::Network => "network",
-            Proposal::Irls => "irls",
-            Proposal::Consistency => "consistency",
-            Proposal::Rigidity => "rigidity",
-            Proposal::Learned => "learned",
-            Proposal::Uniform => "uniform",
-        }
     }
 }
 
@@ -434,6 +392,12 @@ impl Solution {
     /// Indices of the registered views.
     pub fn registered_views(&self) -> Vec<usize> {
         (0..self.views.len()).filter(|&i| self.views[i].projection.is_some()).collect()
+    }
+
+    /// What to say of the views that take no part, see [`left_out::warnings`]; `name` names a view by its index.
+    pub fn left_out_warnings(&self, name: impl Fn(usize) -> String) -> Vec<Warning> {
+        let reasons: Vec<Option<LeftOut>> = self.views.iter().map(|view| view.left_out).collect();
+        left_out::warnings(&reasons, name)
     }
 
     pub fn inlier_track_count(&self) -> usize {

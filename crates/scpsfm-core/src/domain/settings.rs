@@ -3,7 +3,6 @@
 use serde::{Deserialize, Serialize};
 
 use super::error::{InvalidInput, Violation, Violations};
-use super::result::Proposal;
 
 /// Which tracks are right is decided by...
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Default, Serialize, Deserialize)]
@@ -41,6 +40,48 @@ impl Method {
     /// Whether the method optimises the network.
     pub fn uses_network(self) -> bool {
         matches!(self, Method::Auto | Method::Paper | Method::Scpsfm)
+    }
+}
+
+/// What proposed the tracks that the accepted hypothesis was sampled from.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Serialize, Deserialize)]
+#[serde(rename_all = "SCREAMING_SNAKE_CASE")]
+pub enum Proposal {
+    /// The weights of the network that is optimised on the request.
+    Network,
+    /// Iteratively reweighted least squares on the subspace.
+    Irls,
+    /// Agreement of a track's motion over the views.
+    Consistency,
+    /// Distances between tracks that stay the same in all views; where depths are given.
+    Rigidity,
+    /// The network that was trained beforehand, see `scpsfm train-prior`.
+    Learned,
+    /// None: uniform sampling.
+    Uniform,
+}
+
+impl Proposal {
+    /// Every proposal.
+    pub const ALL: [Proposal; 6] = [
+        Proposal::Learned,
+        Proposal::Network,
+        Proposal::Irls,
+        Proposal::Consistency,
+        Proposal::Rigidity,
+        Proposal::Uniform,
+    ];
+
+    /// The proposal's name in files, metrics and logs.
+    pub fn name(self) -> &'static str {
+        match self {
+            Proposal::Network => "network",
+            Proposal::Irls => "irls",
+            Proposal::Consistency => "consistency",
+            Proposal::Rigidity => "rigidity",
+            Proposal::Learned => "learned",
+            Proposal::Uniform => "uniform",
+        }
     }
 }
 

@@ -2,7 +2,7 @@
 
 use super::problem::observed_views;
 use crate::domain::result::ViewResult;
-use crate::domain::{Input, LeftOut, Solution, Status, left_out};
+use crate::domain::{Input, LeftOut, Solution, Status};
 
 /// Gives every view its name and its camera group, and every view that is not registered its reason, where the solver has not; the
 /// warnings tell the reasons.
@@ -15,7 +15,7 @@ pub fn complete(solution: &mut Solution, input: &Input) {
         result.camera_group = view.camera_group;
         result.left_out = reason(result, observed, solved);
     }
-    let told = left_out::warnings(&solution.views, |view| view.to_string());
+    let told = solution.left_out_warnings(|view| view.to_string());
     solution.warnings.extend(told);
 }
 
