@@ -145,8 +145,8 @@ fn structure(counts: &SecondStructureCounts) -> String {
 /// What is known of one camera of several.
 fn camera(camera: &CameraGroupJson) -> String {
     let views = format!("{} of {}", camera.registered_views, counted(camera.views, "view"));
-    let Some(focal_px) = camera.focal_px else { return format!("no calibration, {views}") };
-    let mut text = format!("{}, {views}", focal(focal_px, camera.sigma_log_focal));
+    let Some(focal_px) = camera.intrinsics.focal_px else { return format!("no calibration, {views}") };
+    let mut text = format!("{}, {views}", focal(focal_px, camera.intrinsics.sigma_log_focal));
     if let Some(grade) = camera.grade {
         text.push_str(&format!(", {}", grade.name()));
     }

@@ -2,10 +2,11 @@
 
 use serde::Serialize;
 
+use super::intrinsics_json::{LensJson, SigmasJson};
 use super::result_json::view_label;
 use super::{Label, LabelledInput, warnings};
 use crate::domain::result::ViewResult;
-use crate::domain::{Calibration, LeftOut, LensProjection, Solution, Status, Warning};
+use crate::domain::{Calibration, LeftOut, Solution, Status, Warning};
 
 /// `cameras.json`.
 #[derive(Debug, Clone, Serialize)]
@@ -32,24 +33,14 @@ pub struct CameraJson {
     pub K: Option<[[f64; 3]; 3]>,
     pub R: Option<[[f64; 3]; 3]>,
     pub t: Option<[f64; 3]>,
-    pub lens_projection: Option<LensProjection>,
-    pub radial_k1: Option<f64>,
-    pub radial_k2: Option<f64>,
-    pub radial_k3: Option<f64>,
-    pub tangential_p1: Option<f64>,
-    pub tangential_p2: Option<f64>,
+    #[serde(flatten)]
+    pub lens: LensJson,
     /// The input's number of the view's camera; its calibration is among the `cameras` of `result.json`.
     pub camera_group: u32,
     /// One standard deviation of the log focal length of the group, for a view with a K; null there: unobservable.
     pub sigma_log_focal: Option<f64>,
-    /// The same of the other intrinsics in their units; null: not estimated.
-    pub sigma_principal_point_px: Option<[f64; 2]>,
-    pub sigma_aspect: Option<f64>,
-    pub sigma_radial_k1: Option<f64>,
-    pub sigma_radial_k2: Option<f64>,
-    pub sigma_radial_k3: Option<f64>,
-    pub sigma_tangential_p1: Option<f64>,
-    pub sigma_tangential_p2: Option<f64>,
+    #[serde(flatten)]
+    pub sigmas: SigmasJson,
     /// Why the view is not registered: where no view is, that of the whole.
     pub left_out: Option<ReasonJson>,
 }
@@ -89,21 +80,10 @@ impl CamerasJson {
                 K: calibration.map(|shared| intrinsics(shared, view.focal_px)),
                 R: view.rotation.filter(|_| is_metric),
                 t: view.translation.filter(|_| is_metric),
-                lens_projection: calibration.map(|calibration| calibration.lens_projection),
-                radial_k1: calibration.map(|calibration| calibration.radial_k1),
-                radial_k2: calibration.map(|calibration| calibration.radial_k2),
-                radial_k3: calibration.map(|calibration| calibration.radial_k3),
-                tangential_p1: calibration.map(|calibration| calibration.tangential_p1),
-                tangential_p2: calibration.map(|calibration| calibration.tangential_p2),
+                lens: calibration.map(LensJson::from).unwrap_or_default(),
                 camera_group: view.camera_group,
                 sigma_log_focal: calibration.and_then(|calibration| calibration.sigma_log_focal),
-                sigma_principal_point_px: calibration.and_then(|calibration| calibration.sigmas.principal_point_px),
-                sigma_aspect: calibration.and_then(|calibration| calibration.sigmas.aspect),
-                sigma_radial_k1: calibration.and_then(|calibration| calibration.sigmas.radial_k1),
-                sigma_radial_k2: calibration.and_then(|calibration| calibration.sigmas.radial_k2),
-                sigma_radial_k3: calibration.and_then(|calibration| calibration.sigmas.radial_k3),
-                sigma_tangential_p1: calibration.and_then(|calibration| calibration.sigmas.tangential_p1),
-                sigma_tangential_p2: calibration.and_then(|calibration| calibration.sigmas.tangential_p2),
+                sigmas: calibration.map(SigmasJson::from).unwrap_or_default(),
                 left_out: view.left_out.map(ReasonJson::from).or_else(|| of_all.cloned()),
             }
         };

@@ -10,6 +10,7 @@ pub mod colmap;
 pub mod error;
 pub mod export;
 pub mod input;
+pub mod intrinsics_json;
 pub mod label;
 pub mod manifest;
 pub mod metric;

@@ -142,7 +142,7 @@ fn a_projective_result_gives_no_calibration_and_says_why() {
     for camera in CamerasJson::new(&solution, Some(&input)).views {
         assert!(camera.registered && camera.P.is_some(), "view {}", camera.view);
         assert!(camera.K.is_none() && camera.R.is_none() && camera.t.is_none(), "view {}", camera.view);
-        assert!(camera.radial_k1.is_none(), "view {}", camera.view);
+        assert!(camera.lens.radial_k1.is_none(), "view {}", camera.view);
     }
 }
 
@@ -238,8 +238,8 @@ fn several_camera_groups_are_listed_and_each_view_gets_its_own() {
     assert_eq!(CamerasJson::new(&solution, Some(&input)).views[3].K.expect("metric")[0][0], 80.0);
     assert_eq!((&found[1]["sigma_principal_point_px"][1], &found[1]["sigma_radial_k1"]), (&4.0.into(), &0.002.into()));
     assert_eq!((&found[1]["sigma_aspect"], &found[0]["sigma_radial_k1"]), (&Value::Null, &Value::Null));
-    assert_eq!((cameras.views[3].sigma_radial_k1, cameras.views[0].sigma_radial_k1), (Some(0.002), None));
-    assert_eq!((cameras.views[0].radial_k1, cameras.views[3].radial_k1), (Some(-0.02), Some(0.01)));
+    assert_eq!((cameras.views[3].sigmas.sigma_radial_k1, cameras.views[0].sigmas.sigma_radial_k1), (Some(0.002), None));
+    assert_eq!((cameras.views[0].lens.radial_k1, cameras.views[3].lens.radial_k1), (Some(-0.02), Some(0.01)));
     let views = serde_json::to_value(&cameras).expect("serialisable");
     for (field, value, sigma) in
         [("radial_k3", -0.0005, 0.0004), ("tangential_p1", 0.0625, 0.03), ("tangential_p2", -0.125, 0.04)]

@@ -4,8 +4,9 @@ use serde::Serialize;
 
 use crate::domain::result::ProposalTime;
 use crate::domain::second_structure::SecondStructureKind;
-use crate::domain::{Calibration, Grade, LensProjection, Method, Solution, Status, Warning, WarningCode};
+use crate::domain::{Calibration, Grade, Method, Solution, Status, Warning, WarningCode};
 
+use super::intrinsics_json::IntrinsicsJson;
 use super::track_counts::TrackCounts;
 use super::{Label, LabelledInput, second_structures, warnings};
 
@@ -19,29 +20,9 @@ use super::{Label, LabelledInput, second_structures, warnings};
 pub struct ResultJson {
     pub status: Status,
     pub grade: Option<Grade>,
-    /// Of the first camera group with registered views, down to `sigma_tangential_p2`; see `cameras` where there
-    /// are several.
-    pub focal_px: Option<f64>,
-    pub sigma_log_focal: Option<f64>,
-    pub focal_unobservable: Option<bool>,
-    pub principal_point_px: Option<[f64; 2]>,
-    /// Vertical over horizontal focal length.
-    pub aspect: Option<f64>,
-    /// Of the lens, see [`Calibration`] for the model.
-    pub lens_projection: Option<LensProjection>,
-    pub radial_k1: Option<f64>,
-    pub radial_k2: Option<f64>,
-    pub radial_k3: Option<f64>,
-    pub tangential_p1: Option<f64>,
-    pub tangential_p2: Option<f64>,
-    /// One standard deviation of each that was estimated, in its unit; null: it was not, or an older version solved it.
-    pub sigma_principal_point_px: Option<[f64; 2]>,
-    pub sigma_aspect: Option<f64>,
-    pub sigma_radial_k1: Option<f64>,
-    pub sigma_radial_k2: Option<f64>,
-    pub sigma_radial_k3: Option<f64>,
-    pub sigma_tangential_p1: Option<f64>,
-    pub sigma_tangential_p2: Option<f64>,
+    /// Of the first camera group with registered views; see `cameras` where there are several.
+    #[serde(flatten)]
+    pub intrinsics: IntrinsicsJson,
     /// One entry a camera group, ascending.
     pub cameras: Vec<CameraGroupJson>,
     /// `(n, 1)` in pixels, in the frame `P1 = [I|0]` of the first registered view.
@@ -86,26 +67,8 @@ pub struct CameraGroupJson {
     /// Views of the input, and how many of them are registered.
     pub views: usize,
     pub registered_views: usize,
-    pub focal_px: Option<f64>,
-    /// Null: unobservable where `focal_unobservable` is true, else there is no calibration.
-    pub sigma_log_focal: Option<f64>,
-    pub focal_unobservable: Option<bool>,
-    pub principal_point_px: Option<[f64; 2]>,
-    pub aspect: Option<f64>,
-    pub lens_projection: Option<LensProjection>,
-    pub radial_k1: Option<f64>,
-    pub radial_k2: Option<f64>,
-    pub radial_k3: Option<f64>,
-    pub tangential_p1: Option<f64>,
-    pub tangential_p2: Option<f64>,
-    /// One standard deviation of each that was estimated, in its unit; null: it was not, or an older version solved it.
-    pub sigma_principal_point_px: Option<[f64; 2]>,
-    pub sigma_aspect: Option<f64>,
-    pub sigma_radial_k1: Option<f64>,
-    pub sigma_radial_k2: Option<f64>,
-    pub sigma_radial_k3: Option<f64>,
-    pub sigma_tangential_p1: Option<f64>,
-    pub sigma_tangential_p2: Option<f64>,
+    #[serde(flatten)]
+    pub intrinsics: IntrinsicsJson,
     /// The group's own; that of the result is the worst of its groups that have enough views.
     pub grade: Option<Grade>,
     /// Codes of the warnings that are of this group, each once.
@@ -143,6 +106,10 @@ pub struct ProposalTimeJson {
 
 /// The camera groups of a result, ascending.
 pub fn camera_groups(solution: &Solution) -> Vec<CameraGroupJson> {
+    let without = || IntrinsicsJson {
+        focal_unobservable: solution.is_focal_unobservable().then_some(true),
+        ..IntrinsicsJson::default()
+    };
     let entry = |(camera_group, calibration): (u32, Option<&Calibration>)| {
         let views = || solution.views.iter().filter(move |view| view.camera_group == camera_group);
         let registered_views = views().filter(|view| view.projection.is_some()).count();
@@ -156,27 +123,7 @@ pub fn camera_groups(solution: &Solution) -> Vec<CameraGroupJson> {
             camera_group,
             views: views().count(),
             registered_views,
-            focal_px: calibration.map(|of| of.focal_px),
-            sigma_log_focal: calibration.and_then(|of| of.sigma_log_focal),
-            focal_unobservable: match calibration {
-                Some(of) => Some(of.sigma_log_focal.is_none()),
-                None => solution.is_focal_unobservable().then_some(true),
-            },
-            principal_point_px: calibration.map(|of| of.principal_point_px),
-            aspect: calibration.map(|of| of.aspect),
-            lens_projection: calibration.map(|of| of.lens_projection),
-            radial_k1: calibration.map(|of| of.radial_k1),
-            radial_k2: calibration.map(|of| of.radial_k2),
-            radial_k3: calibration.map(|of| of.radial_k3),
-            tangential_p1: calibration.map(|of| of.tangential_p1),
-            tangential_p2: calibration.map(|of| of.tangential_p2),
-            sigma_principal_point_px: calibration.and_then(|of| of.sigmas.principal_point_px),
-            sigma_aspect: calibration.and_then(|of| of.sigmas.aspect),
-            sigma_radial_k1: calibration.and_then(|of| of.sigmas.radial_k1),
-            sigma_radial_k2: calibration.and_then(|of| of.sigmas.radial_k2),
-            sigma_radial_k3: calibration.and_then(|of| of.sigmas.radial_k3),
-            sigma_tangential_p1: calibration.and_then(|of| of.sigmas.tangential_p1),
-            sigma_tangential_p2: calibration.and_then(|of| of.sigmas.tangential_p2),
+            intrinsics: calibration.map_or_else(without, IntrinsicsJson::from),
             grade: calibration.map_or(solution.grade.filter(|_| !solution.is_metric()), |of| of.grade),
             warnings: codes,
         }
@@ -194,30 +141,16 @@ impl ResultJson {
     /// The summary of a solution; without the input, warnings name views by their numbers.
     pub fn new(solution: &Solution, input: Option<&LabelledInput>) -> Self {
         let cameras = camera_groups(solution);
-        let first = cameras.iter().find(|camera| camera.focal_px.is_some());
+        let first = cameras.iter().map(|camera| camera.intrinsics).find(|of| of.focal_px.is_some());
         let tracks = TrackCounts::new(solution, input);
         Self {
             status: solution.status,
             grade: solution.grade,
-            focal_px: first.and_then(|camera| camera.focal_px),
-            sigma_log_focal: first.and_then(|camera| camera.sigma_log_focal),
-            focal_unobservable: (solution.is_metric() || solution.is_focal_unobservable())
-                .then(|| solution.is_focal_unobservable()),
-            principal_point_px: first.and_then(|camera| camera.principal_point_px),
-            aspect: first.and_then(|camera| camera.aspect),
-            lens_projection: first.and_then(|camera| camera.lens_projection),
-            radial_k1: first.and_then(|camera| camera.radial_k1),
-            radial_k2: first.and_then(|camera| camera.radial_k2),
-            radial_k3: first.and_then(|camera| camera.radial_k3),
-            tangential_p1: first.and_then(|camera| camera.tangential_p1),
-            tangential_p2: first.and_then(|camera| camera.tangential_p2),
-            sigma_principal_point_px: first.and_then(|camera| camera.sigma_principal_point_px),
-            sigma_aspect: first.and_then(|camera| camera.sigma_aspect),
-            sigma_radial_k1: first.and_then(|camera| camera.sigma_radial_k1),
-            sigma_radial_k2: first.and_then(|camera| camera.sigma_radial_k2),
-            sigma_radial_k3: first.and_then(|camera| camera.sigma_radial_k3),
-            sigma_tangential_p1: first.and_then(|camera| camera.sigma_tangential_p1),
-            sigma_tangential_p2: first.and_then(|camera| camera.sigma_tangential_p2),
+            intrinsics: IntrinsicsJson {
+                focal_unobservable: (solution.is_metric() || solution.is_focal_unobservable())
+                    .then(|| solution.is_focal_unobservable()),
+                ..first.unwrap_or_default()
+            },
             plane_at_infinity: solution.plane_at_infinity,
             inlier_tracks: tracks.inlier,
             inlier_observations: solution.inlier_observation_count(),

@@ -6,6 +6,7 @@ use super::chart::{WIDTH, anchor};
 use super::html::{escape, short};
 use super::words;
 use crate::domain::{LensProjection, Solution};
+use crate::formats::intrinsics_json::IntrinsicsJson;
 use crate::formats::result_json::{CameraGroupJson, camera_groups};
 
 /// Camera groups drawn and listed; a page is read by a person.
@@ -56,12 +57,13 @@ pub fn section(solution: &Solution) -> String {
 
 /// Value and standard deviation of each of a group's [`COEFFICIENTS`].
 fn coefficients(group: &CameraGroupJson) -> [(Option<f64>, Option<f64>); COEFFICIENTS.len()] {
+    let IntrinsicsJson { lens, sigmas, .. } = &group.intrinsics;
     [
-        (group.radial_k1, group.sigma_radial_k1),
-        (group.radial_k2, group.sigma_radial_k2),
-        (group.radial_k3, group.sigma_radial_k3),
-        (group.tangential_p1, group.sigma_tangential_p1),
-        (group.tangential_p2, group.sigma_tangential_p2),
+        (lens.radial_k1, sigmas.sigma_radial_k1),
+        (lens.radial_k2, sigmas.sigma_radial_k2),
+        (lens.radial_k3, sigmas.sigma_radial_k3),
+        (lens.tangential_p1, sigmas.sigma_tangential_p1),
+        (lens.tangential_p2, sigmas.sigma_tangential_p2),
     ]
 }
 
@@ -73,22 +75,23 @@ fn columns(groups: &[CameraGroupJson]) -> Vec<usize> {
 
 /// * `columns`: the coefficients to show
 fn row(group: &CameraGroupJson, columns: &[usize]) -> String {
-    let mut focal = group.focal_px.map_or_else(
+    let intrinsics = &group.intrinsics;
+    let mut focal = intrinsics.focal_px.map_or_else(
         || "none".to_owned(),
-        |focal_px| match group.sigma_log_focal {
+        |focal_px| match intrinsics.sigma_log_focal {
             // A small deviation of the logarithm is one of the ratio.
             Some(sigma) => format!("{focal_px:.1} \u{b1} {} ({} %)", short(sigma * focal_px), short(sigma * 100.0)),
             None => format!("{focal_px:.1} (unobservable)"),
         },
     );
-    if group.lens_projection == Some(LensProjection::Fisheye) {
+    if intrinsics.lens.lens_projection == Some(LensProjection::Fisheye) {
         focal.push_str(", fisheye");
     }
     let number = |value: Option<f64>, sigma: Option<f64>| {
         let error = sigma.map_or_else(String::new, |sigma| format!(" \u{b1} {}", short(sigma)));
         value.map_or_else(|| "-".into(), |value| short(value) + &error)
     };
-    let point = |[x, y]: [f64; 2]| match group.sigma_principal_point_px {
+    let point = |[x, y]: [f64; 2]| match intrinsics.sigmas.sigma_principal_point_px {
         Some([sigma_x, sigma_y]) => {
             format!("{x:.1} \u{b1} {}, {y:.1} \u{b1} {}", short(sigma_x), short(sigma_y))
         }
@@ -103,8 +106,8 @@ fn row(group: &CameraGroupJson, columns: &[usize]) -> String {
         group.camera_group,
         group.registered_views,
         group.views,
-        group.principal_point_px.map_or_else(|| "-".into(), point),
-        number(group.aspect, group.sigma_aspect),
+        intrinsics.principal_point_px.map_or_else(|| "-".into(), point),
+        number(intrinsics.aspect, intrinsics.sigmas.sigma_aspect),
         group.grade.map_or("-", |grade| grade.name()),
         if codes.is_empty() { "none".into() } else { codes.join(", ") }
     )
@@ -119,9 +122,9 @@ fn bars(groups: &[CameraGroupJson]) -> String {
     /// Standard deviations that the axis shows about every focal length.
     const SHOWN_SIGMA: f64 = 4.0;
     let groups: Vec<(&CameraGroupJson, f64)> =
-        groups.iter().filter_map(|group| Some((group, group.focal_px?))).collect();
+        groups.iter().filter_map(|group| Some((group, group.intrinsics.focal_px?))).collect();
     let interval = |(group, focal): &(&CameraGroupJson, f64), sigmas: f64| {
-        let sigma = group.sigma_log_focal.filter(|sigma| sigma.is_finite()).unwrap_or(0.0);
+        let sigma = group.intrinsics.sigma_log_focal.filter(|sigma| sigma.is_finite()).unwrap_or(0.0);
         (focal * (-sigmas * sigma).exp(), focal * (sigmas * sigma).exp())
     };
     let finite =
