@@ -12,6 +12,7 @@ use serde::de::DeserializeOwned;
 use serde::{Deserialize, Serialize};
 
 use crate::domain::{StopReason, StopToken};
+use crate::formats::json;
 
 /// Why an evaluation cannot go on.
 #[derive(Debug, thiserror::Error)]
@@ -90,17 +91,13 @@ impl<R: Serialize + DeserializeOwned + Sync, M: Serialize + DeserializeOwned + C
         }
         let whole = whole_lines(&file).map_err(at)?;
         if let Some((first, rest)) = whole.split_first() {
-            let header: Header = serde_json::from_slice(first)
-                .map_err(|error| Error::NotRecords { path: path.clone(), what: error.to_string() })?;
+            let header: Header = json::read(first).map_err(|what| Error::NotRecords { path: path.clone(), what })?;
             if header.build != build {
                 return Err(Error::OtherBuild { path, recorded: header.build, current: build.to_owned() });
             }
             for (index, line) in rest.iter().enumerate() {
-                let record: Record<R, M> = serde_json::from_slice(line).map_err(|error| Error::Malformed {
-                    path: path.clone(),
-                    line: index + 2,
-                    what: error.to_string(),
-                })?;
+                let record: Record<R, M> =
+                    json::read(line).map_err(|what| Error::Malformed { path: path.clone(), line: index + 2, what })?;
                 by_key.insert(key(&record.run), record.measures);
             }
         }

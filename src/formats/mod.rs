@@ -11,6 +11,7 @@ pub mod error;
 pub mod export;
 pub mod input;
 pub mod intrinsics_json;
+pub mod json;
 pub mod label;
 pub mod manifest;
 pub mod metric;

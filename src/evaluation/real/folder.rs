@@ -150,10 +150,10 @@ fn json(file: &Path) -> Result<Value, Error> {
 /// The image size and the focal length.
 fn meta(file: &Path) -> Result<(ImageSize, Option<f64>), Error> {
     let meta = json(file)?;
-    let side = |value: &Value| value.as_u64().and_then(|px| u32::try_from(px).ok()).filter(|&px| px > 0);
-    let given = |place: String, value: &Value| {
-        side(value).ok_or_else(|| Error::place(file, place, "must be a whole number of pixels above 0"))
-    };
+    let sides = 1..=ImageSize::MAX_SIDE_PX;
+    let side = |value: &Value| value.as_u64().and_then(|px| u32::try_from(px).ok()).filter(|px| sides.contains(px));
+    let wanted = format!("must be a whole number of pixels, 1 to {}", ImageSize::MAX_SIDE_PX);
+    let given = |place: String, value: &Value| side(value).ok_or_else(|| Error::place(file, place, wanted.as_str()));
     let named = [("width", "height"), ("image_width", "image_height")];
     let size = if let Some((width, height)) = named.into_iter().find(|(width, _)| meta.get(width).is_some()) {
         (given(format!("`{width}`"), &meta[width])?, given(format!("`{height}`"), &meta[height])?)

@@ -13,6 +13,7 @@ use serde::de::DeserializeOwned;
 use super::Sequence;
 use super::measures::{Answer, Verdicts};
 use crate::domain::counted;
+use crate::formats::json;
 use crate::formats::result_files::{CAMERAS, OBSERVATIONS, RESULT};
 
 /// The solve of a sequence; its files go to [`files`] of `scratch`.
@@ -35,11 +36,15 @@ pub fn files(scratch: &Path) -> PathBuf {
 struct ResultFile {
     grade: Option<String>,
     status: String,
+    #[serde(deserialize_with = "json::positive")]
     focal_px: Option<f64>,
+    #[serde(deserialize_with = "json::not_negative")]
     sigma_log_focal: Option<f64>,
     radial_k1: Option<f64>,
     registered_views: usize,
+    #[serde(deserialize_with = "json::not_negative")]
     reprojection_mean_px: Option<f64>,
+    #[serde(deserialize_with = "json::not_negative")]
     reprojection_rms_px: Option<f64>,
     warnings: Vec<WarningEntry>,
 }
@@ -73,8 +78,8 @@ pub fn answer(sequence: &Sequence, scratch: &Path, status: ExitStatus, complaint
     if !directory.join(RESULT).is_file() {
         return Err(format!("ended with {status}: {complaint}"));
     }
-    let result: ResultFile = json(&directory.join(RESULT))?;
-    let cameras: CamerasFile = json(&directory.join(CAMERAS))?;
+    let result: ResultFile = read(&directory.join(RESULT))?;
+    let cameras: CamerasFile = read(&directory.join(CAMERAS))?;
     let inlier = verdicts(&directory.join(OBSERVATIONS))?;
     if inlier.len() != sequence.inlier.len() {
         return Err(format!(
@@ -99,9 +104,9 @@ pub fn answer(sequence: &Sequence, scratch: &Path, status: ExitStatus, complaint
     })
 }
 
-fn json<T: DeserializeOwned>(file: &Path) -> Result<T, String> {
-    let text = fs::read_to_string(file).map_err(|error| format!("cannot read {}: {error}", file.display()))?;
-    serde_json::from_str(&text).map_err(|error| format!("cannot read {}: {error}", file.display()))
+fn read<T: DeserializeOwned>(file: &Path) -> Result<T, String> {
+    let text = fs::read(file).map_err(|error| format!("cannot read {}: {error}", file.display()))?;
+    json::read(&text).map_err(|error| format!("cannot read {}: {error}", file.display()))
 }
 
 /// The column `inlier` of a solve's `observations.csv`, whose lines are in the order of its input.

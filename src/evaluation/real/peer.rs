@@ -19,6 +19,7 @@ use serde_json::Value;
 use super::Sequence;
 use super::measures::{Answer, Verdicts};
 use crate::domain::{ImageSize, counted};
+use crate::formats::json;
 
 /// Bytes of an answer: verdicts and centres of the largest input take less than half.
 const MOST_BYTES: u64 = 1 << 28;
@@ -59,14 +60,18 @@ impl Verdict {
 #[derive(Deserialize)]
 pub struct PeerFile {
     pub views: usize,
+    #[serde(default, deserialize_with = "json::positive")]
     pub focal: Option<f64>,
     inlier: Option<Vec<Verdict>>,
     observation_inlier: Option<Vec<Verdict>>,
     /// View and track of the observations that it kept.
     pub observations: Option<Vec<[u64; 2]>>,
+    #[serde(default, deserialize_with = "json::not_negative")]
     pub sigma_log_focal: Option<f64>,
     k1: Option<f64>,
+    #[serde(default, deserialize_with = "json::not_negative")]
     reproj: Option<f64>,
+    #[serde(default, deserialize_with = "json::not_negative")]
     rms: Option<f64>,
     grade: Option<String>,
     #[serde(default)]
@@ -100,8 +105,8 @@ pub fn read(scratch: &Path, status: ExitStatus, complaint: &str) -> Result<PeerF
     if length > MOST_BYTES {
         return Err(format!("its answer has {length} bytes, more than {MOST_BYTES}"));
     }
-    let text = fs::read_to_string(&file).map_err(|error| format!("its answer cannot be read: {error}"))?;
-    serde_json::from_str(&text).map_err(|error| format!("its answer cannot be read: {error}"))
+    let text = fs::read(&file).map_err(|error| format!("its answer cannot be read: {error}"))?;
+    json::read(&text).map_err(|error| format!("its answer cannot be read: {error}"))
 }
 
 /// The answer of a peer that ended with `status`.
@@ -110,6 +115,10 @@ pub fn read(scratch: &Path, status: ExitStatus, complaint: &str) -> Result<PeerF
 /// Why there is no answer, in a sentence.
 pub fn answer(sequence: &Sequence, scratch: &Path, status: ExitStatus, complaint: &str) -> Result<Answer, String> {
     let said = read(scratch, status, complaint)?;
+    let views = sequence.input.raw.views.len();
+    if said.views > views {
+        return Err(format!("its answer's `views` is {}, of a sequence of {}", said.views, counted(views, "view")));
+    }
     let (inlier, verdicts) = spread(sequence, &said)?;
     let mut warnings = said.warnings;
     match said.error {
@@ -122,7 +131,7 @@ pub fn answer(sequence: &Sequence, scratch: &Path, status: ExitStatus, complaint
         registered: said.views,
         parts: usize::from(said.views > 0),
         grade: said.grade,
-        focal_px: said.focal.filter(|&focal| focal > 0.0),
+        focal_px: said.focal,
         sigma_log_focal: said.sigma_log_focal.filter(|&sigma| sigma > 0.0),
         radial_k1: said.k1,
         inlier,

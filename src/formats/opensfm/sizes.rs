@@ -8,6 +8,7 @@ use std::path::{Component, Path, PathBuf};
 use serde::Deserialize;
 
 use crate::domain::ImageSize;
+use crate::formats::json;
 
 /// Bytes of such a file at most; OpenSfM's have some hundreds.
 const MOST_BYTES: u64 = 1 << 20;
@@ -58,7 +59,7 @@ impl Sizes {
             }
             Err(error) => return Err(format!("exif/{image}.exif cannot be read: {error}")),
         }
-        let exif: Exif = serde_json::from_str(&text)
+        let exif: Exif = json::read(text.as_bytes())
             .map_err(|error| format!("exif/{image}.exif has no width and height: {error}"))?;
         let sides = 1..=ImageSize::MAX_SIDE_PX;
         if !sides.contains(&exif.width) || !sides.contains(&exif.height) {
@@ -87,7 +88,13 @@ mod tests {
         let exif = sizes.of("sub/a.jpg").expect("readable").expect("there");
         assert_eq!((exif.size().width_px, exif.size().height_px, exif.camera.as_deref()), (640, 480, Some("v2 x")));
         assert_eq!(sizes.of("../secret"), Ok(None));
-        for (text, word) in [("{", "EOF"), (r#"{"width": 3}"#, "height"), (r#"{"width": 0, "height": 4}"#, "0 x 4")] {
+        let cases = [
+            ("{", "EOF"),
+            (r#"{"width": 3}"#, "height"),
+            (r#"{"width": 0, "height": 4}"#, "0 x 4"),
+            (r#"{"width": 3, "height": -4}"#, "`height`: invalid value: integer `-4`"),
+        ];
+        for (text, word) in cases {
             write("exif/b.jpg.exif", text);
             let words = sizes.of("b.jpg").expect_err("no size");
             assert!(words.starts_with("exif/b.jpg.exif") && words.contains(word), "{words}");
