@@ -147,7 +147,7 @@ impl Reconstruction {
         mut judged: Judged,
         structures: Vec<Structure>,
         mut warnings: Vec<Warning>,
-        recorder: Recorder,
+        mut recorder: Recorder,
     ) -> Result<Solution, Error> {
         warnings.extend(self.warnings.iter().cloned());
         let inliers = judged.tracks.inlier.iter().filter(|&&inlier| inlier).count();
@@ -155,6 +155,7 @@ impl Reconstruction {
         if inliers < least {
             let detail = format!("{inliers} tracks hold under the final geometry; {least} can be verified");
             warnings.push(Warning::new(WarningCode::FewInliers, detail));
+            recorder.found(0, None);
             return Ok(nothing(problem, Some(seed), warnings, recorder));
         }
         let structures = second_structures::verified(problem, structures, &judged.tracks.inlier);
@@ -203,11 +204,13 @@ impl Reconstruction {
         judged.tracks.point = points;
         judged.tracks.network_weight = network_weights(problem, seed);
         let (rms, mean) = reprojection(&judged.observations);
+        let calibrations = self.calibrations(problem);
+        recorder.found(inliers, calibrations.first().map(|first| first.focal_px));
         Ok(Solution {
             status: Status::Solved,
             grade: Some(self.grade),
             winning_proposal: seed.found.winning_proposal,
-            calibrations: self.calibrations(problem),
+            calibrations,
             // The frame is affine to the metric one: its plane at infinity is (0, 0, 0, 1).
             plane_at_infinity: self.is_metric().then_some([0.0; 3]),
             views: self.views(problem, &frames),
@@ -319,10 +322,12 @@ fn affine_frame(to_pixels: &Matrix3<f64>, camera: &Camera) -> Option<Matrix4<f64
 }
 
 /// The solution of a scene in which nothing could be reconstructed; the reason is among `warnings`.
-fn unsolved(problem: &Problem, attempt: Option<&Attempt>, warnings: Vec<Warning>, recorder: Recorder) -> Solution {
+fn unsolved(problem: &Problem, attempt: Option<&Attempt>, warnings: Vec<Warning>, mut recorder: Recorder) -> Solution {
+    let decided = attempt.and_then(|attempt| attempt.decided.as_ref());
+    recorder.found(decided.map_or(0, |decided| decided.inlier.iter().filter(|&&inlier| inlier).count()), None);
     let mut solution = nothing(problem, attempt, warnings, recorder);
     let Some(attempt) = attempt else { return solution };
-    if let Some(decided) = &attempt.decided {
+    if let Some(decided) = decided {
         own_verdicts(&attempt.block.tracks, decided, &mut solution.tracks);
     }
     if let Some(track_scores) = attempt.found.track_scores.as_ref().filter(|track_scores| track_scores.ranks()) {
@@ -337,7 +342,8 @@ fn unsolved(problem: &Problem, attempt: Option<&Attempt>, warnings: Vec<Warning>
     solution
 }
 
-/// A solution that says how the solve went, and nothing else.
+/// A solution that says how the solve went, and nothing else. The last progress tells what [`Recorder::found`] was told
+/// last: the caller says before what the solution holds.
 fn nothing(problem: &Problem, attempt: Option<&Attempt>, warnings: Vec<Warning>, recorder: Recorder) -> Solution {
     let (seconds, iterations) = (recorder.seconds(), recorder.iteration());
     let (stages, history) = recorder.finish();

@@ -317,6 +317,8 @@ fn nothing_but_wrong_tracks_is_no_reconstruction() {
         assert_eq!((solution.status, solution.grade), (Status::NoReconstruction, None), "seed {seed}");
         assert!(solution.tracks.inlier.iter().all(|&inlier| !inlier));
         assert!(solution.calibrations.is_empty());
+        let last = solution.history.last().expect("a record");
+        assert_eq!((last.inliers, last.focal_px), (0, None), "what the search tried is not what was found");
         assert!(solution.warnings.iter().any(|warning| warning.code == WarningCode::NoConsensus));
     }
 }
