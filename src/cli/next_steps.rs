@@ -10,45 +10,42 @@ use crate::formats::{Export, Format, result_files};
 /// Warnings that can be why a result is less than METRIC, the most probable cause first, each with what would help. A
 /// wrong size or a wrong model comes before what the views show under it.
 const REMEDIES: [(WarningCode, &str); 15] = [
-    (WarningCode::PointsOutsideImage, "give the size of the images whose pixels these are (--width, --height)"),
+    (
+        WarningCode::PointsOutsideImage,
+        "give the size of the images in which the points were measured (--width, --height)",
+    ),
     (
         WarningCode::ModelMismatch,
-        "if the camera zoomed, use --focal-per-view; if there were several cameras, make each a camera group \
-         (--view-table); else check the tracks, and the focal lengths if any were given",
+        "if the camera zoomed, use --focal-per-view; if there were several cameras, give each its own camera group \
+         (--view-table); otherwise check the tracks, and the focal lengths that were given (--focal-px)",
     ),
-    (WarningCode::Cheirality, "check the order of the views and the size of the images"),
-    (WarningCode::LittleMotion, "add views that are taken from farther apart and turned against each other"),
+    (WarningCode::Cheirality, "check the order of the views and the size of the images (--width, --height)"),
+    (WarningCode::LittleMotion, "add views that are taken from farther apart and in other directions"),
     (WarningCode::PlanarOrRotation, "add views from other places, and objects off the plane"),
-    (WarningCode::PureRotation, "add views that the camera has moved and turned for"),
-    (
-        WarningCode::PureTranslation,
-        "add views that are turned against each other, or give the focal length (--focal-px)",
-    ),
-    (WarningCode::PlanarScene, "add views that are tilted against the plane, or objects off it"),
+    (WarningCode::PureRotation, "add views between which the camera moved, not only turned"),
+    (WarningCode::PureTranslation, "add views between which the camera turned, or give the focal length (--focal-px)"),
+    (WarningCode::PlanarScene, "add views of the plane from other angles, or objects off the plane"),
     (
         WarningCode::UnobservableFocal,
-        "add views that are turned or tilted against each other, or give the focal length (--focal-px)",
+        "add views between which the camera turned or tilted, or give the focal length (--focal-px)",
     ),
     (WarningCode::SecondMinimum, "add views, or give the focal length (--focal-px)"),
-    (
-        WarningCode::UnverifiedRanking,
-        "add views or longer tracks; until then the weights of tracks.csv are a ranking only",
-    ),
-    (WarningCode::FewInliers, "add tracks that three views or more share: more features, or photos with more overlap"),
+    (WarningCode::UnverifiedRanking, "add views or longer tracks; the weights in tracks.csv only rank the tracks"),
+    (WarningCode::FewInliers, "add tracks that three or more views share: more features, or photos with more overlap"),
     (
         WarningCode::NoConsensus,
-        "check the matches and the order of the views; add views, and tracks that three or more share",
+        "check the matches and the order of the views; add views, and tracks that three or more views share",
     ),
     (
         WarningCode::CameraGroupsMerged,
-        "make each camera a group of its own (--view-table), and use --method auto or geometry",
+        "give each camera a camera group of its own (--view-table), and use --method auto or geometry",
     ),
     (WarningCode::AssumedImageSize, "give the size of the images (--width, --height)"),
 ];
 
 /// What helps where no warning says why the focal length is not known better.
 const MORE_VIEWS: &str =
-    "add views, turned and tilted against each other, or give the focal length (--focal-px, --focal-sigma)";
+    "add views between which the camera turned and tilted, or give the focal length (--focal-px, --focal-sigma)";
 
 /// What of a result the sentences depend on.
 #[derive(Debug, Clone, Copy)]
@@ -89,7 +86,9 @@ pub fn steps(outcome: Outcome, files: &Files) -> Vec<String> {
     let report = files.directory.join(result_files::REPORT);
     let holds = match (outcome.status, outcome.grade) {
         (Status::NoReconstruction, _) => "; there are no cameras and no points",
-        (_, Some(Grade::ProjectiveOnly)) => "; tracks.csv and observations.csv say what is right, without K, R and t",
+        (_, Some(Grade::ProjectiveOnly)) => {
+            "; tracks.csv and observations.csv say what is right; there are no K, R and t"
+        }
         _ => "",
     };
     let look = format!("open {}{holds}", report.display());
@@ -105,9 +104,9 @@ pub fn advice(outcome: Outcome) -> Option<String> {
     };
     let has = |code| outcome.warnings.iter().any(|warning| warning.code == code);
     Some(match REMEDIES.iter().find(|(code, _)| has(*code)) {
-        Some((code, remedy)) => format!("{found} by {}: {remedy}", code.name()),
-        None if has(WarningCode::Unknown) => format!("{found}: the warnings of a later version may say why"),
-        None if outcome.has_own_focals => format!("{found} is the best grade where each view has its own focal length"),
+        Some((code, remedy)) => format!("{found} because of {}: {remedy}", code.name()),
+        None if has(WarningCode::Unknown) => format!("{found}: the server is newer, and its warnings may say why"),
+        None if outcome.has_own_focals => format!("{found} is the best grade with --focal-per-view"),
         None => format!("{found}: {MORE_VIEWS}"),
     })
 }
@@ -187,7 +186,7 @@ mod tests {
             for (code, remedy) in REMEDIES {
                 let warnings = [Warning::new(WarningCode::DuplicateTracks, ""), Warning::new(code, "a detail")];
                 let advice = advice(outcome(grade, &warnings)).expect("advice");
-                assert_eq!(advice, format!("{name} by {}: {remedy}", code.name()));
+                assert_eq!(advice, format!("{name} because of {}: {remedy}", code.name()));
             }
             let unexplained = advice(outcome(grade, &[])).expect("advice");
             assert_eq!(unexplained, format!("{name}: {MORE_VIEWS}"));
@@ -195,7 +194,23 @@ mod tests {
         let warnings = [Warning::new(WarningCode::PlanarScene, "")];
         assert_eq!(advice(outcome(Some(Grade::Metric), &warnings)), None);
         let own = Outcome { has_own_focals: true, ..outcome(Some(Grade::Weak), &[]) };
-        assert!(advice(own).expect("advice").contains("is the best grade"));
+        assert!(advice(own).expect("advice").contains("is the best grade with --focal-per-view"));
+    }
+
+    #[test]
+    fn an_option_that_is_advised_is_one_of_solve_and_of_submit() {
+        let texts = REMEDIES.iter().map(|(_, remedy)| *remedy).chain([MORE_VIEWS, "--focal-per-view"]);
+        let words = texts.flat_map(|text| text.split(|c: char| !c.is_ascii_alphanumeric() && c != '-'));
+        let options: Vec<&str> = words.filter_map(|word| word.strip_prefix("--")).collect();
+        assert!(options.len() > 10, "{options:?}");
+        let program = crate::cli::command();
+        for command in ["solve", "submit"] {
+            let command = program.find_subcommand(command).expect("a command");
+            for option in &options {
+                let has = command.get_arguments().any(|argument| argument.get_long() == Some(option));
+                assert!(has, "{} has no --{option}", command.get_name());
+            }
+        }
     }
 
     #[test]
@@ -220,7 +235,7 @@ mod tests {
         let turned = [Warning::new(WarningCode::UnobservableFocal, "")];
         let told = steps(outcome(Some(Grade::ProjectiveOnly), &turned), &files(&[], Some(Format::ColmapDatabase)));
         assert_eq!(told.len(), 3);
-        assert!(told[0].ends_with("without K, R and t") && told[1].contains("right matches"), "{told:?}");
+        assert!(told[0].ends_with("there are no K, R and t") && told[1].contains("right matches"), "{told:?}");
         let table = steps(outcome(Some(Grade::ProjectiveOnly), &turned), &files(&[], Some(Format::Observations)));
         assert_eq!(table.len(), 2, "only a database takes a result that is not metric: {table:?}");
         let exported = [Export::Colmap];

@@ -208,7 +208,7 @@ mod tests {
         let lines = text_with_files(&solution, Some(&input), &files);
         let last: Vec<&str> = lines.lines().rev().take(3).collect();
         assert!(last[2] == "  files        answer" && last[1].starts_with("  next         open answer/"), "{lines}");
-        assert!(last[0].starts_with("               PROJECTIVE_ONLY by UNOBSERVABLE_FOCAL: "), "{lines}");
+        assert!(last[0].starts_with("               PROJECTIVE_ONLY because of UNOBSERVABLE_FOCAL: "), "{lines}");
     }
 
     #[test]

@@ -291,7 +291,7 @@ fn what_cannot_be_solved_ends_with_3_and_says_why() {
             told.contains(&format!("\nnext: scpsfm result {name} --server {} --out DIR\n", serving.grpc)),
             "{told}"
         );
-        assert!(told.contains("\n      NO_RECONSTRUCTION by "), "{told}");
+        assert!(told.contains("\n      NO_RECONSTRUCTION because of "), "{told}");
     }
     let all = json(&run(["get", name, "--json"].iter().chain(&server)).stdout);
     assert_eq!(all["summary"]["warnings"], result["warnings"]);
