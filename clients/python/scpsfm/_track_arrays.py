@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from ._fields import ARRAYS, MAX_INDEX, invalid, is_whole
 from ._views import Label, View, plain_views, view_problems
+from ._words import counted
 from .errors import InvalidArgument
 
 __all__ = ["MAX_POSITION_PX", "Made", "TrackArrays"]
@@ -119,7 +120,7 @@ def _check(tracks: TrackArrays) -> None:
     if problems:
         raise fail(problems)
     if len(tracks.views) < 2:
-        raise fail([("views", f"{len(tracks.views)} views; at least 2 are needed")])
+        raise fail([("views", f"{counted(len(tracks.views), 'view')}; at least 2 are needed")])
     if count == 0:
         raise fail([("x", "there are no observations")])
     if not is_whole(tracks.track_count, 1, MAX_INDEX):
@@ -144,9 +145,10 @@ def _check(tracks: TrackArrays) -> None:
     for field, entries in (("track_labels", tracks.track_count), ("view_labels", len(tracks.views))):
         labels = getattr(tracks, field)
         if labels is not None and len(labels) != entries:
-            raise fail([(field, f"has {len(labels)} entries, {entries} are needed")])
+            raise fail([(field, f"has {counted(len(labels), 'entry')} where {entries} are needed")])
     if tracks.image_ids is not None and len(tracks.image_ids) != len(tracks.views):
-        raise fail([("image_ids", f"has {len(tracks.image_ids)} entries, there are {len(tracks.views)} views")])
+        held = counted(len(tracks.image_ids), "entry")
+        raise fail([("image_ids", f"has {held}, there are {len(tracks.views)} views")])
     for row in (*rows.values(), tracks.image_ids):
         if row is not None:
             row.setflags(write=False)

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from ._fields import MAX_INDEX, invalid, is_whole, is_within
+from ._words import counted
 
 __all__ = [
     "MAX_SIDE_PX",
@@ -79,7 +80,8 @@ def alike(
     size = size_of(field, width, height)
     for what, given in (("names", names), ("camera_groups", camera_groups)):
         if given is not None and len(given) != count:
-            raise invalid([(what, f"has {len(given)} entries, there are {count} views")], field=field)
+            words = f"has {counted(len(given), 'entry')}, there are {counted(count, 'view')}"
+            raise invalid([(what, words)], field=field)
     return tuple(
         View(
             name="" if names is None else names[index],

@@ -15,6 +15,7 @@ from ._fields import MAX_INDEX, invalid
 from ._stubs import input_pb2, result_pb2
 from ._track_arrays import MAX_POSITION_PX
 from ._views import FocalPrior, View, alike, append_views, plain_views, view_problems
+from ._words import counted
 from .errors import InternalError, InvalidArgument
 from .tracks import Tracks
 
@@ -78,9 +79,10 @@ class Matches:
             raise _wrong("views", "give either views, or width, height, names, camera_groups and focal_prior")
         self.views = tuple(views)
         if len(self.views) != len(self.keypoints):
-            raise _wrong("views", f"has {len(self.views)} entries, there are keypoints of {len(self.keypoints)} views")
+            entries, of_views = counted(len(self.views), "entry"), counted(len(self.keypoints), "view")
+            raise _wrong("views", f"has {entries}, there are keypoints of {of_views}")
         if len(self.views) < 2:
-            raise _wrong("views", f"{len(self.views)} views; at least 2 are needed")
+            raise _wrong("views", f"{counted(len(self.views), 'view')}; at least 2 are needed")
         problems = list(view_problems(self.views))
         if problems:
             raise invalid(problems, field=self._FIELD)
@@ -120,7 +122,7 @@ class Matches:
         wrong = np.argwhere((array < 0) | (array > MAX_INDEX) | (array >= counts))
         if wrong.size:
             match, side = wrong[0]
-            what = f"{array[match, side]} is outside the {counts[side]} keypoints of view {pair[side]}"
+            what = f"{array[match, side]} is outside the {counted(int(counts[side]), 'keypoint')} of view {pair[side]}"
             raise _wrong(f"{field}[{match},{side}]", what)
         return np.unique(array.astype(np.uint32), axis=0) if array.size else np.zeros((0, 2), dtype=np.uint32)
 
@@ -130,7 +132,8 @@ class Matches:
 
     def __repr__(self) -> str:
         count = sum(len(of_view) for of_view in self.keypoints)
-        return f"Matches({len(self.views)} views, {count} keypoints, {len(self.pairs)} pairs, {len(self)} matches)"
+        views, keypoints, pairs = counted(len(self.views), "view"), counted(count, "keypoint"), len(self.pairs)
+        return f"Matches({views}, {keypoints}, {counted(pairs, 'pair')}, {counted(len(self), 'match')})"
 
     def _head(self) -> input_pb2.MatchSet:
         """The message without the arrays of keypoints and matches."""

@@ -22,6 +22,7 @@ from ._read.tables import read_csv, read_opensfm
 from ._stubs import input_pb2
 from ._track_arrays import TrackArrays
 from ._views import FocalPrior, Label, View, alike, append_views, size_of
+from ._words import counted
 from .errors import InvalidArgument
 
 __all__ = ["FocalPrior", "Label", "Tracks", "View"]
@@ -42,7 +43,8 @@ class Tracks(TrackArrays):
 
     def __repr__(self) -> str:
         source = "" if self.file is None else f", file={self.file!r}"
-        return f"Tracks({len(self.views)} views, {self.track_count} tracks, {len(self)} observations{source})"
+        views, tracks = counted(len(self.views), "view"), counted(self.track_count, "track")
+        return f"Tracks({views}, {tracks}, {counted(len(self), 'observation')}{source})"
 
     @classmethod
     def from_arrays(

@@ -116,7 +116,7 @@ def test_a_plain_table_and_one_that_is_not_are_read_alike(tmp_path: Path, extra:
         ("view,track,x,y\n0,0,1\n", ["3 fields where the header has 4", "truncated"], 2),
         ("view,track,x,y\n0,0,1,5,2,5\n", ["6 fields", "marked by a point"], 2),
         ("view,track,x,y\n0,0,1,2\n1,0,1,2\n\n0,0,3,4\n", ["track 0", "second time in view 0", "line 2"], 5),
-        ("view,track,x,y\n0,0,1,2\n0,1,3,4\n", ["1 views; at least 2"], None),
+        ("view,track,x,y\n0,0,1,2\n0,1,3,4\n", ["1 view; at least 2"], None),
         ("view,track,x,y\n0,0,1,2\n1,0,2e7,4\n", ["x[1]", "from the origin"], 3),
         ("view,track,x,y,sigma\n0,0,1,2,1\n1,0,2,4,0\n", ["sigma_px[1]"], 3),
         ("view,track,x,y,depth\n0,0,1,2,1\n1,0,2,4,0\n", ["depth[1]"], 3),
@@ -272,7 +272,7 @@ def test_models_are_read_by_name_with_keypoints(tmp_path: Path, make: Any) -> No
     assert tracks.xy.tolist() == [[10, 20], [30, 40], [5, 6], [7, 8]]
     assert tracks.keypoint_index is not None
     assert tracks.keypoint_index.tolist() == [0, 2, 0, 1]
-    assert "1 observations were left out" in tracks.notes[0]
+    assert "left out 1 observation beyond" in tracks.notes[0]
     assert "camera 2 is of COLMAP's model FOV" in tracks.notes[1]
     assert (tracks.lines is not None) == (make is text_model)
 
@@ -364,7 +364,7 @@ def test_a_database_is_joined_into_tracks(tmp_path: Path) -> None:
     assert table == [
         (k, view, 10.0 * image + k, float(k), k) for k in range(3) for view, image in ((0, 2), (1, 1), (2, 3))
     ]
-    assert "3 tracks were joined from 6 verified matches of 2 image pairs; 0 matches were cut" in tracks.notes[0]
+    assert "joined 6 verified matches of 2 image pairs into 3 tracks; cut 0 matches, " in tracks.notes[0]
 
 
 def test_raw_matches_stand_in_where_none_are_verified(tmp_path: Path) -> None:
@@ -389,7 +389,7 @@ PAIR = 1 * MAX_IMAGES + 3
         ("UPDATE images SET name = x'00' WHERE image_id = 3", (), "row 3: name: bytes is no text"),
         ("UPDATE keypoints SET image_id = 8 WHERE image_id = 1", (), "row 8: is of no image"),
         ("UPDATE keypoints SET rows = 5 WHERE image_id = 1", (), "row 1: data: has 64 bytes, 5 x 4"),
-        ("UPDATE keypoints SET cols = 1, rows = 16 WHERE image_id = 1", (), "has 1 columns"),
+        ("UPDATE keypoints SET cols = 1, rows = 16 WHERE image_id = 1", (), "has 1 column,"),
         ("INSERT INTO two_view_geometries VALUES (?, 1, 2, ?)", (PAIR, struct.pack("<2I", 0, 4)), "one is not there"),
         ("INSERT INTO two_view_geometries VALUES (?, 1, 2, ?)", (PAIR + 90, b"\0" * 8), "does not have"),
         ("INSERT INTO two_view_geometries VALUES (?, 1, 2, ?)", (MAX_IMAGES + 1, b"\0" * 8), "with itself"),

@@ -97,7 +97,7 @@ def test_other_views_are_checked_too() -> None:
     refused("track_set.views[1].name", "of view 0 already", tracks.with_views, [View("a"), View("a")])
     three = Tracks.from_arrays([0, 0, 1, 2], TRACK, X, Y)
     refused("track_set.view_indices[3]", "2 is not below 2", three.with_views, [View(), View()])
-    refused("track_set.views", "1 views; at least 2", tracks.with_views, [View()])
+    refused("track_set.views", "1 view; at least 2", tracks.with_views, [View()])
 
 
 @pytest.mark.parametrize("field", ["x", "y", "sigma_px", "depth"])
@@ -140,7 +140,7 @@ def test_what_is_not_finite_is_refused(field: str, value: float) -> None:
         ({"width": 640}, "track_set.views", "width and height are given together"),
         ({"width": 0, "height": 480}, "track_set.views[0].size.width_px", "0 is not a whole number from 1"),
         ({"width": 640, "height": 1_000_001}, "track_set.views[0].size.height_px", "1000001"),
-        ({"names": ["a"]}, "track_set.names", "has 1 entries, there are 2"),
+        ({"names": ["a"]}, "track_set.names", "has 1 entry, there are 2"),
         ({"names": ["a", "a"]}, "track_set.views[1].name", "is the name of view 0 already"),
         ({"names": ["a", "b\n"]}, "track_set.views[1].name", "control characters"),
         ({"names": ["a", "\u00e9" * 2049]}, "track_set.views[1].name", "longer than 4096 bytes"),

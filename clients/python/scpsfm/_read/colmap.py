@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from .._fields import MAX_INDEX
 from .._track_arrays import Made
 from .._views import MAX_SIDE_PX, FocalPrior, View
+from .._words import counted
 from .problems import dense, of_file
 
 __all__ = ["FIRST_PIXEL", "MODELS", "Camera", "Images", "Model"]
@@ -161,14 +162,14 @@ class Images:
 
         """
         if not len(image):
-            raise of_file(path, f"has {len(self)} images, and no keypoint of a point in space")
+            raise of_file(path, f"has {counted(len(self), 'image')}, and no keypoint of a point in space")
         order = np.lexsort((np.arange(len(image)), image, track))
         repeated = np.zeros(len(image), dtype=bool)
         again = (track[order[1:]] == track[order[:-1]]) & (image[order[1:]] == image[order[:-1]])
         repeated[order[1:][again]] = True
         if repeated.any():
-            what = "observations were left out, each the second of a track in one image"
-            notes = [*notes, f"{repeated.sum()} {what}"]
+            left_out = counted(int(repeated.sum()), "observation")
+            notes = [*notes, f"left out {left_out} beyond the first of a track in one image"]
             kept = ~repeated
             image, track, xy, keypoint = image[kept], track[kept], xy[kept], keypoint[kept]
             lines = None if lines is None else lines[kept]

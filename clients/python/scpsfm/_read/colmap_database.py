@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from .._fields import MAX_INDEX
 from .._track_arrays import Made
+from .._words import counted
 from .colmap import MODELS, Camera, Images
 from .join import join
 from .problems import of_file
@@ -69,8 +70,9 @@ def _read(connection: sqlite3.Connection, kind: type[Made], path: Path, matches:
             image_of = (np.searchsorted(starts, np.arange(len(points)), side="right") - 1).astype(np.int64)
             joined = join(found, image_of)
             note = (
-                f"{joined.tracks} tracks were joined from {len(found)} {choice} matches of {pairs} image pairs; "
-                f"{joined.cut} matches were cut, which would have put two keypoints of one image into one track"
+                f"joined {counted(len(found), f'{choice} match')} of {counted(pairs, 'image pair')} into "
+                f"{counted(joined.tracks, 'track')}; cut {counted(joined.cut, 'match')}, which would have put two "
+                "keypoints of one image into one track"
             )
             image = image_of[joined.keypoints]
             return images.tracks(
@@ -132,7 +134,7 @@ def _matrix(path: Path, table: str, row: Any, rows: Any, columns: Any, data: Any
     if not isinstance(data, bytes):
         raise of_file(path, f"table {table}, row {row}: data: {type(data).__name__} is no blob")
     if rows > 0 and columns < 2:
-        raise of_file(path, f"table {table}, row {row}: data: has {columns} columns, at least 2 are needed")
+        raise of_file(path, f"table {table}, row {row}: data: has {counted(columns, 'column')}, at least 2 are needed")
     if rows * columns * 4 != len(data):
         what = f"has {len(data)} bytes, {rows} x {columns} numbers of 4 are announced"
         raise of_file(path, f"table {table}, row {row}: data: {what}")

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from .._track_arrays import Made
 from .._views import MAX_SIDE_PX, FocalPrior, Label, View
+from .._words import counted
 from .problems import Problems, dense, number, of_file, quote, whole
 
 __all__ = ["frame", "read_csv", "read_opensfm"]
@@ -209,7 +210,7 @@ def _wrong_count(count: int, header: list[str]) -> str:
         hint = "; the file may be truncated"
     elif count == len(header) + 2 + sum(name in header for name in _OPTIONAL):
         hint = "; decimals are marked by a point, not a comma"
-    return f"{count} fields where the header has {len(header)}{hint}"
+    return f"{counted(count, 'field')} where the header has {len(header)}{hint}"
 
 
 @dataclass(frozen=True)
@@ -253,7 +254,7 @@ def read_opensfm(kind: type[Made], path: Path, size: tuple[int, int] | None, foc
         fields = text.split("\t")
         if len(fields) != columns:
             hint = "; the file may be truncated" if len(fields) < columns else ""
-            what = f"{len(fields)} fields where this version has {columns}, separated by tabs{hint}"
+            what = f"{counted(len(fields), 'field')} where this version has {columns}, separated by tabs{hint}"
             problems.add(line, "", what)
             continue
         column = "x"

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from .._result_data import ResultData
 from .._result_parts import Calibration, Camera
+from .._words import counted
 from ..errors import FailedPrecondition, InvalidArgument, Violation
 from ..tracks import Label, Tracks
 
@@ -83,7 +84,10 @@ def check(tracks: Tracks, result: ResultData) -> None:
     told = (len(result.cameras), len(result.tracks.inlier), len(result.observations.inlier))
     given = (len(tracks.views), tracks.track_count, len(tracks))
     if told != given:
-        what = f"is of {told[0]} views, {told[1]} tracks and {told[2]} observations, the tracks have {given}"
+        views, track_count, observations = (
+            counted(count, noun) for count, noun in zip(told, ("view", "track", "observation"), strict=True)
+        )
+        what = f"is of {views}, {track_count} and {observations}, the tracks have {given}"
         raise InvalidArgument(f"result: {what}", reason="INVALID_ARGUMENT", violations=[Violation("result", what)])
 
 
