@@ -125,9 +125,11 @@ impl LeastSquares for Descent<'_> {
             return None;
         }
         let step = &reduced.vector;
-        let possible = retract(to, from, pool.layout, step) && substitute(to, from, normal, damping, step, pool);
-        // The rows of the Jacobian are not kept: what they predict is not known.
-        possible.then_some(f64::NAN)
+        if !retract(to, from, pool.layout, step) {
+            return None;
+        }
+        let of_points = substitute(to, from, normal, damping, step, pool)?;
+        Some(reduced.predicted(normal, damping) + of_points)
     }
 
     fn attempt(
