@@ -15,7 +15,6 @@ use crate::http;
 use crate::rpc::convert::result::encode as encode_result;
 use crate::rpc::keys::Sources;
 use crate::rpc::server::{self, Server};
-use crate::store::instrumented::InstrumentedStore;
 use crate::store::postgres::Postgres;
 use crate::store::sqlite::Sqlite;
 use crate::store::{QueueBounds, Store, TenantShares};
@@ -189,11 +188,11 @@ async fn close(store: &dyn Store) {
 async fn open_store(config: &config::Store) -> Result<Arc<dyn Store>, Failure> {
     if let Some(url) = &config.url {
         let failed = |error| Failure::internal(format_args!("cannot open the store {url}: {error}"));
-        return Ok(Arc::new(InstrumentedStore(Postgres::open(url).await.map_err(failed)?)));
+        return Ok(Arc::new(Postgres::open(url).await.map_err(failed)?));
     }
     let directory = config.data_dir.display();
     let failed = |error| Failure::internal(format_args!("cannot open the data directory {directory}: {error}"));
-    Ok(Arc::new(InstrumentedStore(Sqlite::open(&config.data_dir).await.map_err(failed)?)))
+    Ok(Arc::new(Sqlite::open(&config.data_dir).await.map_err(failed)?))
 }
 
 /// A bound that 0 lifts.

@@ -5,7 +5,6 @@
 
 mod clock;
 mod input_query;
-pub mod instrumented;
 pub mod payload;
 pub mod postgres;
 pub mod query;

@@ -342,12 +342,12 @@ pub const UNKNOWN_METHOD: &str = "unknown";
 /// What a worker writes, under the lease on its job.
 const FENCED_OPERATIONS: [&str; 4] = ["heartbeat", "record", "finish", "release"];
 
-/// The store refused a write of a worker whose lease was gone; `operation` is the name of the trait's method.
+/// The store refused a write of a worker whose lease was gone; `operation` is its name in the metrics.
 pub fn write_fenced(operation: &'static str) {
     counter!(FENCED_WRITES.name, "operation" => operation).increment(1);
 }
 
-/// A store operation begins; `operation` is the name of the trait's method.
+/// A store operation begins; `operation` is its name in the metrics.
 pub fn store_operation(operation: &'static str) -> StoreTimer {
     StoreTimer::begin(operation)
 }
