@@ -76,7 +76,7 @@ impl From<store::Error> for Error {
             store::Error::UploadNotFound(name) => Error::UploadNotFound(name),
             store::Error::UploadTakenOver(_) => Error::TakenOver(error.to_string()),
             store::Error::UploadsFull(bound) => {
-                Error::UploadsFull { bound: bound.quota().name(), message: bound.to_string() }
+                Error::UploadsFull { bound: bound.quota.name(), message: bound.to_string() }
             }
             store::Error::UploadTooLarge(oversize) => Error::UploadTooLarge(oversize),
             store::Error::BatchTooLarge(oversize) => Error::BatchTooLarge(oversize),

@@ -76,7 +76,7 @@ impl Engine {
                 Ok(Begun::Open(Upload { engine: self.clone(), lease, committed, bytes: new.bytes, sha256 }))
             }
             Err(store::Error::UploadsFull(bound)) => {
-                observe::upload_refused(observe::UploadRefusal::Full(bound.quota()));
+                observe::upload_refused(observe::UploadRefusal::Full(bound.quota));
                 Err(store::Error::UploadsFull(bound).into())
             }
             Err(store::Error::UploadTooLarge(oversize)) => {

@@ -3,6 +3,7 @@
 //! Only this module sees SQL, but for `formats`, which reads COLMAP's databases. Depends on `domain` and `telemetry`;
 //! the state machine's rules are the domain's, what is written in one transaction is decided here.
 
+mod bounds;
 mod clock;
 mod input_query;
 pub mod payload;
@@ -26,17 +27,16 @@ use crate::domain::job::{Job, JobEvent, JobName, JobState};
 use crate::domain::progress::Progress;
 use crate::domain::{InputName, Oversize};
 
+pub use bounds::{Bound, QueueBounds, UploadBounds};
 pub use clock::Clock;
 pub use input_query::{InputPage, InputQuery};
 pub use query::{JobPage, JobQuery, Order};
 pub use record::{
-    Bound, CancelReply, Claim, Claimed, Claims, Created, EncodedResult, Ending, Heartbeat, JobInput, JobPayload, Lease,
-    NewRecord, Outcome, PassedOver, Prefetch, QueueBounds, QueueReport, QueueStats, Request, RetryReply, StoreStats,
-    Swept, TenantQueue, TenantShares, WebhookOutcome, WebhookQueue,
+    CancelReply, Claim, Claimed, Claims, Created, EncodedResult, Ending, Heartbeat, JobInput, JobPayload, Lease,
+    NewRecord, Outcome, PassedOver, Prefetch, QueueReport, QueueStats, Request, RetryReply, StoreStats, Swept,
+    TenantQueue, TenantShares, WebhookOutcome, WebhookQueue,
 };
-pub use upload::{
-    BegunUpload, NewInput, NewUpload, PurgedUploads, StoredInput, UploadBound, UploadBounds, UploadLease, UploadStatus,
-};
+pub use upload::{BegunUpload, NewInput, NewUpload, PurgedUploads, StoredInput, UploadLease, UploadStatus};
 
 /// Why the store did not do what it was asked.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
@@ -52,7 +52,7 @@ pub enum Error {
     UploadTakenOver(InputName),
     /// The tenant has as many uploads as it may.
     #[error("{0}")]
-    UploadsFull(UploadBound),
+    UploadsFull(Bound),
     /// The upload alone is more than the tenant may ever have.
     #[error("{0}")]
     UploadTooLarge(Oversize),

@@ -1,15 +1,14 @@
 //! What goes into the store and what workers get from it.
 
 use std::collections::BTreeMap;
-use std::fmt;
 use std::sync::Arc;
 use std::time::{Duration, SystemTime};
 
 use sha2::{Digest, Sha256};
 
+use crate::domain::SolveSettings;
 use crate::domain::job::{Failure, Job, JobName, JobState, Summary};
 use crate::domain::progress::Progress;
-use crate::domain::{Oversize, Quota, SolveSettings};
 
 /// A job to be stored.
 #[derive(Debug, Clone)]
@@ -81,132 +80,6 @@ pub struct Created {
     pub new: bool,
 }
 
-/// How much may wait at once.
-#[derive(Debug, Clone, PartialEq, Eq)]
-pub struct QueueBounds {
-    pub max_jobs: u64,
-    /// Encoded inputs.
-    pub max_bytes: u64,
-    pub max_observations: u64,
-    /// Of one tenant alone.
-    pub max_tenant_jobs: u64,
-    /// Encoded inputs of one tenant alone.
-    pub max_tenant_bytes: u64,
-}
-
-impl QueueBounds {
-    /// Whether tenants have bounds of their own.
-    pub fn has_tenant_bounds(&self) -> bool {
-        self.max_tenant_jobs < u64::MAX || self.max_tenant_bytes < u64::MAX
-    }
-
-    /// The bound that these jobs break by themselves, however little waits: together they never fit.
-    pub fn never_takes(&self, batch: &[&NewRecord]) -> Option<Oversize> {
-        let mut whole = QueueStats::default();
-        let mut tenants: BTreeMap<&str, QueueStats> = BTreeMap::new();
-        for new in batch {
-            whole.add(new);
-            tenants.entry(&new.name.tenant).or_default().add(new);
-        }
-        // One job that waits alone may be of any size.
-        let of_several = |stats: &QueueStats, amount| if stats.queued > 1 { amount } else { 0 };
-        let of_tenant = |stats: &QueueStats| {
-            first_broken([
-                (Quota::TenantJobs, stats.queued, self.max_tenant_jobs),
-                (Quota::TenantBytes, of_several(stats, stats.queued_bytes), self.max_tenant_bytes),
-            ])
-        };
-        tenants.values().find_map(of_tenant).or_else(|| {
-            first_broken([
-                (Quota::Jobs, whole.queued, self.max_jobs),
-                (Quota::Bytes, of_several(&whole, whole.queued_bytes), self.max_bytes),
-                (Quota::Observations, of_several(&whole, whole.queued_observations), self.max_observations),
-            ])
-        })
-    }
-
-    /// The first bound that one more job would break: of the tenant's own, then of the whole queue's.
-    pub fn refuses(&self, whole: &QueueStats, tenant: &QueueStats, bytes: u64, observations: u64) -> Option<Bound> {
-        self.refuses_tenant(tenant, bytes).or_else(|| self.refuses_all(whole, bytes, observations))
-    }
-
-    fn refuses_tenant(&self, stats: &QueueStats, bytes: u64) -> Option<Bound> {
-        if stats.queued >= self.max_tenant_jobs {
-            Some(Bound { quota: Quota::TenantJobs, waiting: stats.queued, asked: 1, max: self.max_tenant_jobs })
-        } else if stats.queued > 0 && stats.queued_bytes.saturating_add(bytes) > self.max_tenant_bytes {
-            // As below: a tenant's job that waits alone always fits.
-            let (waiting, max) = (stats.queued_bytes, self.max_tenant_bytes);
-            Some(Bound { quota: Quota::TenantBytes, waiting, asked: bytes, max })
-        } else {
-            None
-        }
-    }
-
-    fn refuses_all(&self, stats: &QueueStats, bytes: u64, observations: u64) -> Option<Bound> {
-        if stats.queued >= self.max_jobs {
-            return Some(Bound { quota: Quota::Jobs, waiting: stats.queued, asked: 1, max: self.max_jobs });
-        }
-        // A job alone in the queue always fits: what is too large for an empty queue is refused by the limits on
-        // inputs.
-        if stats.queued == 0 {
-            None
-        } else if stats.queued_bytes.saturating_add(bytes) > self.max_bytes {
-            Some(Bound { quota: Quota::Bytes, waiting: stats.queued_bytes, asked: bytes, max: self.max_bytes })
-        } else if stats.queued_observations.saturating_add(observations) > self.max_observations {
-            let (waiting, max) = (stats.queued_observations, self.max_observations);
-            Some(Bound { quota: Quota::Observations, waiting, asked: observations, max })
-        } else {
-            None
-        }
-    }
-}
-
-/// The bound of the queue that refused a job, or a batch.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub struct Bound {
-    pub quota: Quota,
-    /// How much of it waits, without what was refused.
-    pub waiting: u64,
-    /// How much the call asked for.
-    pub asked: u64,
-    pub max: u64,
-}
-
-impl Bound {
-    /// The same of a batch: `stored` are those of its jobs that were stored and count as waiting, and `rest` begins with
-    /// the job that was refused.
-    pub fn of_batch(self, stored: &[&NewRecord], rest: &[NewRecord]) -> Self {
-        let of_tenant = matches!(self.quota, Quota::TenantJobs | Quota::TenantBytes);
-        let tenant = rest.first().filter(|_| of_tenant).map(|refused| refused.name.tenant.as_str());
-        let amount = |news: &mut dyn Iterator<Item = &NewRecord>| {
-            let mut stats = QueueStats::default();
-            news.filter(|new| tenant.is_none_or(|tenant| new.name.tenant == tenant)).for_each(|new| stats.add(new));
-            match self.quota {
-                Quota::Bytes | Quota::TenantBytes => stats.queued_bytes,
-                Quota::Observations => stats.queued_observations,
-                _ => stats.queued,
-            }
-        };
-        let before = amount(&mut stored.iter().copied());
-        let asked = before.saturating_add(amount(&mut rest.iter()));
-        Self { waiting: self.waiting.saturating_sub(before), asked, ..self }
-    }
-}
-
-impl fmt::Display for Bound {
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        let Self { quota, waiting, asked, max } = self;
-        let (full, what) = match quota {
-            Quota::TenantJobs => ("the tenant's share of the queue", "jobs"),
-            Quota::TenantBytes => ("the tenant's share of the queue", "bytes of input"),
-            Quota::Bytes => ("the queue", "bytes of input"),
-            Quota::Observations => ("the queue", "observations"),
-            _ => ("the queue", "jobs"),
-        };
-        write!(f, "{full} is full: {what} waiting: {waiting}, asked for: {asked}, allowed: {max}")
-    }
-}
-
 /// What waits and what runs.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
 pub struct QueueStats {
@@ -236,12 +109,13 @@ impl QueueStats {
         self.queued_bytes = self.queued_bytes.saturating_add(new.input.bytes());
         self.queued_observations = self.queued_observations.saturating_add(u64::from(new.observation_count));
     }
-}
 
-/// The first of these amounts, each with what is asked and what is allowed, that is more than allowed.
-fn first_broken<const N: usize>(amounts: [(Quota, u64, u64); N]) -> Option<Oversize> {
-    let broken = amounts.into_iter().find(|(_, asked, max)| asked > max);
-    broken.map(|(quota, asked, max)| Oversize { quota, asked, max })
+    /// Of these jobs.
+    pub fn of<'a>(news: impl IntoIterator<Item = &'a NewRecord>) -> Self {
+        let mut stats = Self::default();
+        news.into_iter().for_each(|new| stats.add(new));
+        stats
+    }
 }
 
 /// How tenants share the workers.

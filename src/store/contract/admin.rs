@@ -101,10 +101,10 @@ pub(in crate::store) async fn a_retry_is_refused_where_there_is_nothing_to_do_or
     assert_eq!((retried.job.state, retried.job.deadline), (JobState::Queued, None));
     let before = store.job(&cancelled.name).await.expect("a job");
     let full = store.retry_job(&cancelled.name, None, &one, time(7)).await;
-    assert_eq!(full, Err(Error::QueueFull(Bound { quota: Quota::Jobs, waiting: 1, asked: 1, max: 1 })));
+    assert_eq!(full, Err(Error::QueueFull(Bound { quota: Quota::Jobs, taken: 1, asked: 1, max: 1 })));
     let of_tenant = QueueBounds { max_tenant_jobs: 1, ..ROOM };
     let full = store.retry_job(&cancelled.name, None, &of_tenant, time(7)).await;
-    assert_eq!(full, Err(Error::QueueFull(Bound { quota: Quota::TenantJobs, waiting: 1, asked: 1, max: 1 })));
+    assert_eq!(full, Err(Error::QueueFull(Bound { quota: Quota::TenantJobs, taken: 1, asked: 1, max: 1 })));
     assert_eq!(store.job(&cancelled.name).await, Ok(before));
     assert_eq!(retry(store, &cancelled.name, 8).await.expect("there is room").state, JobState::Queued);
 }

@@ -110,14 +110,14 @@ pub(in crate::store) async fn admission_bounds_what_waits(store: &dyn Store) {
     assert_eq!((stats.queued, stats.queued_bytes, stats.queued_observations, stats.running), (2, 200, 120, 0));
     assert_eq!(
         refused(QueueBounds { max_jobs: 2, ..ROOM }).await,
-        Bound { quota: Quota::Jobs, waiting: 2, asked: 1, max: 2 }
+        Bound { quota: Quota::Jobs, taken: 2, asked: 1, max: 2 }
     );
     assert_eq!(
         refused(QueueBounds { max_bytes: 299, ..ROOM }).await,
-        Bound { quota: Quota::Bytes, waiting: 200, asked: 100, max: 299 }
+        Bound { quota: Quota::Bytes, taken: 200, asked: 100, max: 299 }
     );
     let bound = refused(QueueBounds { max_observations: 179, ..ROOM }).await;
-    assert_eq!(bound, Bound { quota: Quota::Observations, waiting: 120, asked: 60, max: 179 });
+    assert_eq!(bound, Bound { quota: Quota::Observations, taken: 120, asked: 60, max: 179 });
     assert!(matches!(store.job(&record("late").name).await, Err(Error::NotFound(_))), "nothing was stored");
     claim(store, 2).await;
     let stats = store.queue_stats().await.expect("counts");
@@ -137,10 +137,10 @@ pub(in crate::store) async fn admission_bounds_each_tenant(store: &dyn Store) {
     store.create_job(of("t", "a"), &alone, time(0)).await.expect("a job that waits alone always fits");
     let larger = NewRecord { input: vec![7; 151].into(), ..of("t", "b") };
     let error = store.create_job(larger, &bounds, time(0)).await.expect_err("too many bytes");
-    assert_eq!(error, Error::QueueFull(Bound { quota: Quota::TenantBytes, waiting: 100, asked: 151, max: 250 }));
+    assert_eq!(error, Error::QueueFull(Bound { quota: Quota::TenantBytes, taken: 100, asked: 151, max: 250 }));
     store.create_job(of("t", "b"), &bounds, time(0)).await.expect("room for two");
     let error = store.create_job(of("t", "c"), &bounds, time(0)).await.expect_err("room for two");
-    assert_eq!(error, Error::QueueFull(Bound { quota: Quota::TenantJobs, waiting: 2, asked: 1, max: 2 }));
+    assert_eq!(error, Error::QueueFull(Bound { quota: Quota::TenantJobs, taken: 2, asked: 1, max: 2 }));
     let batch = vec![of("u", "a"), of("u", "b"), of("u", "c")];
     let error = store.create_jobs(batch, &bounds, time(0)).await.expect_err("a batch counts as a whole");
     assert_eq!(error, Error::BatchTooLarge(Oversize { quota: Quota::TenantJobs, asked: 3, max: 2 }));
@@ -161,17 +161,17 @@ pub(in crate::store) async fn a_batch_is_stored_whole_or_not_at_all(store: &dyn 
     // One of the two has room, both have not.
     let bounds = QueueBounds { max_jobs: 2, ..ROOM };
     let error = store.create_jobs(batch[..2].to_vec(), &bounds, time(1)).await.expect_err("full");
-    let bound = Bound { quota: Quota::Jobs, waiting: 1, asked: 2, max: 2 };
+    let bound = Bound { quota: Quota::Jobs, taken: 1, asked: 2, max: 2 };
     assert_eq!(error, Error::QueueFull(bound), "one waits, and both of the batch were asked for");
     assert_eq!(bound.to_string(), "the queue is full: jobs waiting: 1, asked for: 2, allowed: 2");
-    for (bounds, quota, waiting, asked, max) in [
+    for (bounds, quota, taken, asked, max) in [
         (QueueBounds { max_bytes: 299, ..ROOM }, Quota::Bytes, 100, 200, 299),
         (QueueBounds { max_observations: 179, ..ROOM }, Quota::Observations, 60, 120, 179),
         (QueueBounds { max_tenant_jobs: 2, ..ROOM }, Quota::TenantJobs, 1, 2, 2),
         (QueueBounds { max_tenant_bytes: 299, ..ROOM }, Quota::TenantBytes, 100, 200, 299),
     ] {
         let error = store.create_jobs(batch[..2].to_vec(), &bounds, time(1)).await.expect_err("full");
-        assert_eq!(error, Error::QueueFull(Bound { quota, waiting, asked, max }));
+        assert_eq!(error, Error::QueueFull(Bound { quota, taken, asked, max }));
     }
     assert!(matches!(store.job(&record("a").name).await, Err(Error::NotFound(_))), "nothing was stored");
     assert_eq!(store.queue_stats().await.expect("counts").queued, 1);

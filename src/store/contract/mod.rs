@@ -15,9 +15,10 @@ use std::time::{Duration, SystemTime};
 
 use crate::domain::job::{AttemptEnd, EventBody, Failure, Job, JobName, JobState, PastAttempt, Summary};
 use crate::domain::{Progress, ReconstructionProgress, SolveSettings, Stage, Status, Step, Task};
-use crate::store::record::{Bound, NewRecord, QueueBounds, Request};
+use crate::store::record::{NewRecord, Request};
 use crate::store::{
-    ATTEMPTS_EXHAUSTED, Claim, Claimed, EncodedResult, Ending, Error, JobQuery, Lease, Order, Outcome, Store, payload,
+    ATTEMPTS_EXHAUSTED, Bound, Claim, Claimed, EncodedResult, Ending, Error, JobQuery, Lease, Order, Outcome,
+    QueueBounds, Store, payload,
 };
 
 /// Runs the contract: `$open` is an async function without arguments whose result, where the database is there, derefs

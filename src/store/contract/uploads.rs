@@ -3,10 +3,8 @@
 use super::*;
 use crate::domain::{InputName, Oversize, Quota};
 use crate::store::record::JobInput;
-use crate::store::upload::{
-    BegunUpload, NewInput, NewUpload, PurgedUploads, StoredInput, UploadBound, UploadBounds, UploadLease,
-};
-use crate::store::{InputPage, InputQuery};
+use crate::store::upload::{BegunUpload, NewInput, NewUpload, PurgedUploads, StoredInput, UploadLease};
+use crate::store::{InputPage, InputQuery, UploadBounds};
 
 pub(in crate::store) const ROOMY: UploadBounds =
     UploadBounds { max_bytes: u64::MAX, max_tenant_uploads: u64::MAX, max_tenant_bytes: u64::MAX };
@@ -165,9 +163,12 @@ pub(in crate::store) async fn a_tenants_uploads_are_bounded(store: &dyn Store) {
     let done = finished(store, "done", vec![7; 100], 0).await;
     assert_eq!((done.upload_bytes, done.payload_bytes), (4, 100));
     begin_within(new("a", 200)).await.expect("room");
-    assert_eq!(refused(new("b", 197)).await, UploadBound::Bytes { taken: 204, asked: 197, max: 400 });
+    assert_eq!(
+        refused(new("b", 197)).await,
+        Bound { quota: Quota::TenantUploadBytes, taken: 204, asked: 197, max: 400 }
+    );
     begin_within(new("b", 196)).await.expect("room");
-    assert_eq!(refused(new("c", 1)).await, UploadBound::Uploads { open: 2, max: 2 });
+    assert_eq!(refused(new("c", 1)).await, Bound { quota: Quota::TenantUploads, taken: 2, asked: 1, max: 2 });
     begin_within(new("b", 196)).await.expect("one that is open goes on");
     let mut elsewhere = new("c", 400);
     elsewhere.name.tenant = "u".into();
@@ -310,7 +311,8 @@ pub(in crate::store) async fn a_deleted_input_is_kept_by_its_jobs_alone(store: &
     let taken = 4;
     let tight = UploadBounds { max_tenant_uploads: 1, max_tenant_bytes: taken + 3, ..ROOMY };
     let refused = store.begin_upload(&new("shared", 4), &tight, time(3)).await;
-    assert_eq!(refused, Err(Error::UploadsFull(UploadBound::Bytes { taken, asked: 4, max: taken + 3 })));
+    let bound = Bound { quota: Quota::TenantUploadBytes, taken, asked: 4, max: taken + 3 };
+    assert_eq!(refused, Err(Error::UploadsFull(bound)));
     let bounds = UploadBounds { max_tenant_uploads: 1, max_tenant_bytes: taken + 4, ..ROOMY };
     let again = store.begin_upload(&new("shared", 4), &bounds, time(3)).await.expect("room");
     let BegunUpload::Open { lease, committed: 0, .. } = again else { panic!("{again:?}") };
@@ -341,7 +343,7 @@ pub(in crate::store) async fn many_that_begin_at_once_share_the_last_room(store:
     for outcome in begun {
         match outcome {
             Ok(BegunUpload::Open { lease, .. }) => open.push(lease),
-            Err(Error::UploadsFull(UploadBound::Uploads { open: 3, max: 3 })) => {}
+            Err(Error::UploadsFull(Bound { quota: Quota::TenantUploads, taken: 3, .. })) => {}
             other => panic!("{other:?}"),
         }
     }

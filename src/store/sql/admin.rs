@@ -10,7 +10,8 @@ use super::rows::{self, Transition, locked_job, micros, number, returning_job};
 use super::{Change, Connection, Lock, Row, Statement, webhooks};
 use crate::domain::job::{Job, JobName, JobState};
 use crate::store::Error;
-use crate::store::record::{QueueBounds, QueueReport, RetryReply, TenantQueue};
+use crate::store::QueueBounds;
+use crate::store::record::{QueueReport, QueueStats, RetryReply, TenantQueue};
 
 /// Puts a job that ended without a result into the queue again; see [`crate::store::Store::retry_job`].
 pub(super) async fn retry<C: Connection>(
@@ -33,10 +34,10 @@ pub(super) async fn retry<C: Connection>(
     }
     let size = Statement::new("SELECT input_bytes, observation_count FROM jobs WHERE id = $1").bind(job.id);
     let size = connection.row(size).await?;
+    let (queued_bytes, queued_observations) = (number(&size, "input_bytes")?, number(&size, "observation_count")?);
+    let asked = QueueStats { queued: 1, queued_bytes, queued_observations, ..QueueStats::default() };
     let (whole, tenant) = AdmissionStats::default().look(connection, &name.tenant, bounds).await?;
-    if let Some(bound) =
-        bounds.refuses(&whole, &tenant, number(&size, "input_bytes")?, number(&size, "observation_count")?)
-    {
+    if let Some(bound) = bounds.refuses(&whole, &tenant, &asked) {
         return Err(Error::QueueFull(bound));
     }
     // The number of its attempt goes on: it is the fencing token.

@@ -7,10 +7,8 @@ use super::rows::{self, integer, micros, number, returning_job, select_jobs};
 use super::{Change, Connection, Lock, Row, Statement, fairness, uploads, webhooks};
 use crate::domain::job::{EventBody, Job, JobEvent, JobName, JobState};
 use crate::domain::{InputName, Webhook};
-use crate::store::record::{
-    Created, EncodedResult, JobInput, JobPayload, NewRecord, QueueBounds, QueueStats, Request, TenantQueue,
-};
-use crate::store::{Error, JobPage, JobQuery, Order, TakenId, payload};
+use crate::store::record::{Created, EncodedResult, JobInput, JobPayload, NewRecord, QueueStats, Request, TenantQueue};
+use crate::store::{Error, JobPage, JobQuery, Order, QueueBounds, TakenId, payload};
 
 /// Number of a job's first event, which its row counts.
 const FIRST_EVENT: u64 = 1;
@@ -69,7 +67,7 @@ pub(super) async fn create<C: Connection>(
     Ok(created)
 }
 
-/// Counts the whole batch where one of its jobs was refused; see [`crate::store::record::Bound::of_batch`].
+/// Counts the whole batch where one of its jobs was refused; see [`crate::store::Bound::of_batch`].
 fn of_batch(error: Error, stored: &[&NewRecord], rest: &[NewRecord]) -> Error {
     match error {
         Error::QueueFull(bound) => Error::QueueFull(bound.of_batch(stored, rest)),
@@ -194,7 +192,7 @@ async fn admit<C: Connection>(
         return Err(Error::AlreadyExists(TakenId::Job(new.name.clone())));
     }
     let (whole, tenant) = stats.look(connection, &new.name.tenant, bounds).await?;
-    match bounds.refuses(&whole, &tenant, new.input.bytes(), u64::from(new.observation_count)) {
+    match bounds.refuses(&whole, &tenant, &QueueStats::of([new])) {
         Some(bound) => Err(Error::QueueFull(bound)),
         None => Ok(None),
     }

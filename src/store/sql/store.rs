@@ -14,13 +14,10 @@ use crate::domain::job::{Job, JobEvent, JobName};
 use crate::domain::progress::Progress;
 use crate::store::record::{
     CancelReply, Claim, Claims, Created, EncodedResult, Ending, Heartbeat, JobInput, JobPayload, Lease, NewRecord,
-    Outcome, PassedOver, QueueBounds, QueueReport, QueueStats, Request, RetryReply, StoreStats, Swept, WebhookOutcome,
-    WebhookQueue,
+    Outcome, PassedOver, QueueReport, QueueStats, Request, RetryReply, StoreStats, Swept, WebhookOutcome, WebhookQueue,
 };
-use crate::store::upload::{
-    BegunUpload, NewInput, NewUpload, PurgedUploads, StoredInput, UploadBounds, UploadLease, UploadStatus,
-};
-use crate::store::{Error, InputPage, InputQuery, JobPage, JobQuery, Notification, Store};
+use crate::store::upload::{BegunUpload, NewInput, NewUpload, PurgedUploads, StoredInput, UploadLease, UploadStatus};
+use crate::store::{Error, InputPage, InputQuery, JobPage, JobQuery, Notification, QueueBounds, Store, UploadBounds};
 use crate::telemetry::metrics::{store_operation, write_fenced};
 
 /// Waits for an operation as long as the database allows it. One that is broken off changed nothing, or all that it was

@@ -6,10 +6,8 @@ use std::time::SystemTime;
 use super::rows::{self, integer, micros, number};
 use super::{Connection, Lock, Row, Statement, jobs};
 use crate::domain::input_name::InputName;
-use crate::store::upload::{
-    BegunUpload, NewInput, NewUpload, PurgedUploads, StoredInput, UploadBounds, UploadLease, UploadStatus,
-};
-use crate::store::{Error, InputPage, InputQuery, TakenId, payload};
+use crate::store::upload::{BegunUpload, NewInput, NewUpload, PurgedUploads, StoredInput, UploadLease, UploadStatus};
+use crate::store::{Error, InputPage, InputQuery, TakenId, UploadBounds, payload};
 
 /// Rows of parts that one look removes at most, 32 MB of them: writers wait meanwhile.
 const PURGE_PARTS: u32 = 128;
