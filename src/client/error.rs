@@ -263,13 +263,14 @@ mod tests {
     use tonic_types::ErrorDetails;
 
     use super::*;
+    use crate::engine::{self, StoreError};
     use crate::rpc::status;
     use crate::telemetry::metrics::RateBound;
 
     #[test]
     fn violations_come_back_with_field_and_index() {
         let sent = Violation::at("track_set.xs", 17, "NaN is not a finite number");
-        let status = status::invalid(&sent.clone().into());
+        let status = status::invalid(sent.clone());
         let error = Error::from_status("http://a", &status, true);
         assert_eq!((error.kind, error.reason.as_deref()), (ErrorKind::Invalid, Some("INVALID_ARGUMENT")));
         assert_eq!(error.violations, [sent]);
@@ -286,9 +287,9 @@ mod tests {
         assert!(may_be_done(&broken(io::ErrorKind::ConnectionReset)));
         assert!(may_be_done(&Status::unknown("stream was terminated without a final status")));
         assert!(may_be_done(&Status::unavailable("a proxy's page")));
-        assert!(may_be_done(&status::from_engine(crate::engine::Error::Unavailable("within a commit".into()))));
+        assert!(may_be_done(&engine::Error::from(StoreError::Unavailable("within a commit".into())).into()));
         assert!(!may_be_done(&broken(io::ErrorKind::ConnectionRefused)), "nobody was there");
-        assert!(!may_be_done(&status::from_engine(crate::engine::Error::Draining)), "it was refused");
+        assert!(!may_be_done(&engine::Error::Draining.into()), "it was refused");
     }
 
     #[test]

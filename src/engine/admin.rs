@@ -2,14 +2,14 @@
 
 use super::{Engine, Error, Inner, Phase, QueueReport, finished, observe};
 use crate::domain::job::{Job, JobName};
-use crate::store;
 
 impl Engine {
     /// Puts a job that ended without a result into the queue again, with its attempts counted anew; one that waits or
     /// runs is left as it is. With an etag, only where it is the job's. Returns the job as it stands then.
     ///
     /// # Errors
-    /// [`Error::NotFound`], [`Error::EtagMismatch`], [`Error::Succeeded`], [`Error::QueueFull`], [`Error::Draining`].
+    /// [`StoreError::NotFound`], [`StoreError::EtagMismatch`], [`StoreError::Succeeded`], [`StoreError::QueueFull`],
+    /// [`Error::Draining`].
     pub async fn retry(&self, name: &JobName, etag: Option<String>) -> Result<Job, Error> {
         let (inner, name) = (self.inner.clone(), name.clone());
         // On its own task: a caller that goes away must not leave a queued job untold.
@@ -19,7 +19,7 @@ impl Engine {
     /// Changes the priority of a queued job; with an etag, only where it is the job's.
     ///
     /// # Errors
-    /// [`Error::NotFound`], [`Error::EtagMismatch`], [`Error::NotQueued`].
+    /// [`StoreError::NotFound`], [`StoreError::EtagMismatch`], [`StoreError::NotQueued`].
     pub async fn set_priority(&self, name: &JobName, etag: Option<&str>, priority: i32) -> Result<Job, Error> {
         Ok(self.inner.dated(self.inner.store.set_priority(name, etag, priority).await?))
     }
@@ -28,7 +28,7 @@ impl Engine {
     /// goes on.
     ///
     /// # Errors
-    /// [`Error::Unavailable`].
+    /// [`StoreError::Unavailable`].
     pub async fn pause(&self) -> Result<(), Error> {
         self.set_paused(true).await
     }
@@ -36,7 +36,7 @@ impl Engine {
     /// Ends a pause of the queue.
     ///
     /// # Errors
-    /// [`Error::Unavailable`].
+    /// [`StoreError::Unavailable`].
     pub async fn resume(&self) -> Result<(), Error> {
         self.set_paused(false).await
     }
@@ -52,7 +52,7 @@ impl Engine {
     /// The queue over all servers of the store, with at most `tenants` tenants.
     ///
     /// # Errors
-    /// [`Error::Unavailable`].
+    /// [`StoreError::Unavailable`].
     pub async fn queue(&self, tenants: u32) -> Result<QueueReport, Error> {
         Ok(self.inner.store.queue(tenants).await?)
     }
@@ -75,10 +75,7 @@ impl Inner {
             return Err(Error::Draining);
         }
         let retried = self.store.retry_job(name, etag, &self.options.queue, self.now()).await;
-        if let Err(store::Error::QueueFull(bound)) = &retried {
-            observe::refused(observe::Refusal::QueueFull(bound.quota));
-        }
-        let reply = retried?;
+        let reply = retried.inspect_err(observe::refused_by_store)?;
         if reply.queued_now {
             tracing::info!(job = %name, "retried");
             self.notifier.wake(name);

@@ -29,8 +29,8 @@ use tokio::sync::{Notify, watch as channel};
 use tokio_util::sync::CancellationToken;
 
 pub use crate::store::{
-    Clock, EncodedResult, InputPage, InputQuery, JobPage, JobQuery, NewUpload, Order, QueueBounds, QueueReport,
-    QueueStats, StoredInput, TakenId, TenantQueue, TenantShares, UploadBounds, UploadStatus,
+    Bound, Clock, EncodedResult, Error as StoreError, InputPage, InputQuery, JobPage, JobQuery, NewUpload, Order,
+    QueueBounds, QueueReport, QueueStats, StoredInput, TakenId, TenantQueue, TenantShares, UploadBounds, UploadStatus,
 };
 pub use crate::telemetry::metrics::GivenUp;
 pub use drain::Drained;
@@ -181,8 +181,8 @@ impl Engine {
     /// Admits and stores a job. A repeated request id with the same body gives the job that the first call made.
     ///
     /// # Errors
-    /// [`Error::QueueFull`] at once when too much waits, [`Error::BatchTooLarge`], [`Error::JobTooLarge`],
-    /// [`Error::AlreadyExists`] for a taken job id or a request id with another body, [`Error::InvalidArgument`],
+    /// [`StoreError::QueueFull`] at once when too much waits, [`StoreError::BatchTooLarge`], [`Error::JobTooLarge`],
+    /// [`StoreError::AlreadyExists`] for a taken job id or a request id with another body, [`Error::InvalidArgument`],
     /// [`Error::Draining`].
     pub async fn submit(&self, new: NewJob) -> Result<Job, Error> {
         self.inner.clone().submit(new).await
@@ -199,7 +199,7 @@ impl Engine {
     /// One job.
     ///
     /// # Errors
-    /// [`Error::NotFound`].
+    /// [`StoreError::NotFound`].
     pub async fn job(&self, name: &JobName) -> Result<Job, Error> {
         Ok(self.inner.dated(self.inner.store.job(name).await?))
     }
@@ -207,7 +207,7 @@ impl Engine {
     /// One page of a tenant's jobs.
     ///
     /// # Errors
-    /// [`Error::InvalidArgument`] for a page token of another query.
+    /// [`StoreError::PageToken`].
     pub async fn list(&self, query: &JobQuery) -> Result<JobPage, Error> {
         let page = self.inner.store.jobs(query).await?;
         let jobs = page.jobs.into_iter().map(|job| self.inner.dated(job)).collect();
@@ -217,7 +217,7 @@ impl Engine {
     /// Replays a job's events after a sequence number (0: all of them), then follows it to its end. See [`Watch`].
     ///
     /// # Errors
-    /// [`Error::NotFound`]; [`Error::InvalidArgument`] for a number beyond the job's latest event.
+    /// [`StoreError::NotFound`]; [`Error::InvalidArgument`] for a number beyond the job's latest event.
     pub async fn watch(&self, name: &JobName, after_sequence: u64) -> Result<Watch, Error> {
         Watch::open(self.inner.clone(), name.clone(), after_sequence).await
     }
@@ -226,7 +226,7 @@ impl Engine {
     /// a running one ends soon after, which its events tell.
     ///
     /// # Errors
-    /// [`Error::NotFound`].
+    /// [`StoreError::NotFound`].
     pub async fn cancel(&self, name: &JobName) -> Result<Job, Error> {
         self.cancel_as_of(name, None).await
     }
@@ -234,7 +234,7 @@ impl Engine {
     /// The same, only where the etag is the job's.
     ///
     /// # Errors
-    /// [`Error::NotFound`], [`Error::EtagMismatch`].
+    /// [`StoreError::NotFound`], [`StoreError::EtagMismatch`].
     pub async fn cancel_as_of(&self, name: &JobName, etag: Option<String>) -> Result<Job, Error> {
         let (inner, name) = (self.inner.clone(), name.clone());
         // On its own task: a caller that goes away must not leave a stored cancel untold.
@@ -245,7 +245,7 @@ impl Engine {
     /// creation. Whether the job goes on without it is the caller's to decide, by [`Job::attached_calls`].
     ///
     /// # Errors
-    /// [`Error::NotFound`].
+    /// [`StoreError::NotFound`].
     pub async fn detach(&self, name: &JobName, created: SystemTime) -> Result<Job, Error> {
         Ok(self.inner.store.detach(name, created).await?)
     }
@@ -254,7 +254,7 @@ impl Engine {
     /// job's.
     ///
     /// # Errors
-    /// [`Error::NotFound`], [`Error::NotEnded`], [`Error::EtagMismatch`].
+    /// [`StoreError::NotFound`], [`StoreError::NotEnded`], [`StoreError::EtagMismatch`].
     pub async fn delete(&self, name: &JobName, etag: Option<&str>) -> Result<(), Error> {
         self.inner.store.delete_job(name, etag).await?;
         observe::jobs_deleted(observe::Deletion::Requested, 1);
@@ -274,14 +274,14 @@ impl Engine {
     /// The encoded result of a succeeded job.
     ///
     /// # Errors
-    /// [`Error::NotFound`], [`Error::NotReady`] for a job in any other state, [`Error::Internal`] for one that is not
+    /// [`StoreError::NotFound`], [`Error::NotReady`] for a job in any other state, [`Error::Internal`] for one that is not
     /// what was stored.
     pub async fn result(&self, name: &JobName) -> Result<EncodedResult, Error> {
         let state = self.inner.store.job(name).await?.state;
         if state != JobState::Succeeded {
             return Err(Error::NotReady(state));
         }
-        let result = self.inner.store.result(name).await?.ok_or_else(|| Error::NotFound(name.clone()))?;
+        let result = self.inner.store.result(name).await?.ok_or_else(|| StoreError::NotFound(name.clone()))?;
         let corrupt = store::Error::Corrupt(format!("the result of {name} is not what was stored"));
         // Megabytes to hash: not on a thread that serves others.
         let checked = move || if result.is_intact() { Ok(result) } else { Err(corrupt) };
@@ -299,11 +299,6 @@ impl Engine {
     /// What can be done with the store, as of a look a second.
     pub fn store_state(&self) -> channel::Receiver<StoreState> {
         self.inner.store_state.subscribe()
-    }
-
-    /// Whether a drain has begun.
-    pub fn is_draining(&self) -> bool {
-        self.inner.phase() != Phase::Open
     }
 
     /// Ends the wait of a drain, also of one that is still to come: what runs goes back to the queue now.

@@ -29,8 +29,6 @@ pub struct Options {
     pub uploads: UploadOptions,
     /// How long ended jobs are kept, and uploaded inputs that no job has; `None`: for good.
     pub retention: Option<Duration>,
-    /// What callers of a full queue are told to wait.
-    pub retry_after: Duration,
     /// Jobs that are solved in less than this are short: behind one the next, which is prefetched, is begun at once.
     /// Zero: none is prefetched.
     pub short_job: Duration,
@@ -65,8 +63,6 @@ impl Options {
     /// What passes between two jobs, a commit of the store and a dozen wake-ups, takes some 3 ms: a large part of jobs
     /// of 10 ms, and less than a thirtieth of those beyond.
     pub const DEFAULT_SHORT_JOB: Duration = Duration::from_millis(100);
-    /// About the time of one job.
-    pub const DEFAULT_RETRY_AFTER: Duration = Duration::from_secs(3);
 
     /// Three quarters of the memory of the machine or container, where the system tells: the rest is for calls, the
     /// store and the program.
@@ -94,7 +90,6 @@ impl Default for Options {
             max_attempts: Self::DEFAULT_MAX_ATTEMPTS,
             max_solver_bytes: Self::default_solver_bytes(),
             retention: Some(Self::DEFAULT_RETENTION),
-            retry_after: Self::DEFAULT_RETRY_AFTER,
             short_job: Self::DEFAULT_SHORT_JOB,
             worker_name: worker_name(),
             backend: Backend::default(),

@@ -6,7 +6,7 @@ use std::time::{Duration, SystemTime};
 
 use sha2::{Digest, Sha256};
 
-use super::{Error, Inner, Phase, WebhookOptions, finished, observe, webhooks};
+use super::{Error, Inner, Phase, StoreError, WebhookOptions, finished, observe, webhooks};
 use crate::domain::error::{Violation, Violations, quoted};
 use crate::domain::job::{Job, JobName};
 use crate::domain::{Backend, Input, InputName, Oversize, Quota, SolveSettings};
@@ -99,7 +99,7 @@ impl NewJob {
         if let JobInput::Uploaded(name) = &self.input
             && name.tenant != self.tenant
         {
-            return Err(Error::InputNotFound(name.clone()));
+            return Err(StoreError::InputNotFound(name.clone()).into());
         }
         found.into_result()?;
         if let Some(url) = &self.webhook_url {
@@ -125,7 +125,7 @@ impl NewJob {
                 named = payload::encode(&found.name.to_string())?;
                 (store::JobInput::Uploaded { input: found.name.input, bytes: found.payload_bytes }, counts)
             }
-            (JobInput::Uploaded(name), None) => return Err(Error::InputNotFound(name.clone())),
+            (JobInput::Uploaded(name), None) => return Err(StoreError::InputNotFound(name.clone()).into()),
         };
         let digested = match &input {
             store::JobInput::Inline(bytes) => bytes.as_slice(),
@@ -232,26 +232,14 @@ impl Inner {
     }
 
     async fn store_jobs(&self, records: Vec<NewRecord>, now: SystemTime) -> Result<Vec<Job>, Error> {
-        match self.store.create_jobs(records, &self.options.queue, now).await {
-            Ok(created) => {
-                let new = created.iter().filter(|created| created.new).count();
-                (0..new).for_each(|_| observe::job_created());
-                if new > 0 {
-                    self.work_waits();
-                    self.queue_changed();
-                }
-                Ok(created.into_iter().map(|created| self.dated(created.job)).collect())
-            }
-            Err(store::Error::QueueFull(bound)) => {
-                observe::refused(observe::Refusal::QueueFull(bound.quota));
-                let retry_after = self.options.retry_after;
-                Err(Error::QueueFull { retry_after, bound: bound.quota.name(), message: bound.to_string() })
-            }
-            Err(store::Error::BatchTooLarge(oversize)) => {
-                observe::refused(observe::Refusal::BatchTooLarge(oversize.quota));
-                Err(Error::BatchTooLarge(oversize))
-            }
-            Err(error) => Err(error.into()),
+        let created = self.store.create_jobs(records, &self.options.queue, now).await;
+        let created = created.inspect_err(observe::refused_by_store)?;
+        let new = created.iter().filter(|created| created.new).count();
+        (0..new).for_each(|_| observe::job_created());
+        if new > 0 {
+            self.work_waits();
+            self.queue_changed();
         }
+        Ok(created.into_iter().map(|created| self.dated(created.job)).collect())
     }
 }

@@ -62,35 +62,27 @@ pub struct Upload {
 }
 
 impl Engine {
-    /// Begins an upload, or goes on with one; its earlier streams end with [`Error::TakenOver`].
+    /// Begins an upload, or goes on with one; its earlier streams end with [`StoreError::UploadTakenOver`].
     ///
     /// # Errors
-    /// [`Error::AlreadyExists`] where it was begun with another length or hash, [`Error::UploadsFull`],
-    /// [`Error::UploadTooLarge`], [`Error::Draining`].
+    /// [`StoreError::AlreadyExists`] where it was begun with another length or hash, [`StoreError::UploadsFull`],
+    /// [`StoreError::UploadTooLarge`], [`Error::Draining`].
     pub async fn begin_upload(&self, new: NewUpload) -> Result<Begun, Error> {
         self.inner.check_open()?;
         let bounds = &self.inner.options.uploads.bounds;
-        match self.inner.store.begin_upload(&new, bounds, self.inner.now()).await {
-            Ok(BegunUpload::Finished(input)) => Ok(Begun::Finished(input)),
-            Ok(BegunUpload::Open { lease, committed, sha256 }) => {
+        let begun = self.inner.store.begin_upload(&new, bounds, self.inner.now()).await;
+        match begun.inspect_err(observe::refused_by_store)? {
+            BegunUpload::Finished(input) => Ok(Begun::Finished(input)),
+            BegunUpload::Open { lease, committed, sha256 } => {
                 Ok(Begun::Open(Upload { engine: self.clone(), lease, committed, bytes: new.bytes, sha256 }))
             }
-            Err(store::Error::UploadsFull(bound)) => {
-                observe::upload_refused(observe::UploadRefusal::Full(bound.quota));
-                Err(store::Error::UploadsFull(bound).into())
-            }
-            Err(store::Error::UploadTooLarge(oversize)) => {
-                observe::upload_refused(observe::UploadRefusal::TooLarge(oversize.quota));
-                Err(Error::UploadTooLarge(oversize))
-            }
-            Err(error) => Err(error.into()),
         }
     }
 
     /// How far an upload has come.
     ///
     /// # Errors
-    /// [`Error::UploadNotFound`].
+    /// [`StoreError::UploadNotFound`].
     pub async fn upload_status(&self, name: &InputName) -> Result<UploadStatus, Error> {
         Ok(self.inner.store.upload(name).await?)
     }
@@ -98,7 +90,7 @@ impl Engine {
     /// One page of a tenant's uploaded inputs.
     ///
     /// # Errors
-    /// [`Error::InvalidArgument`] for a page token of another query.
+    /// [`StoreError::PageToken`].
     pub async fn list_inputs(&self, query: &InputQuery) -> Result<InputPage, Error> {
         Ok(self.inner.store.inputs(query).await?)
     }
@@ -106,7 +98,7 @@ impl Engine {
     /// Deletes an uploaded input; jobs that were created with it keep it to their end.
     ///
     /// # Errors
-    /// [`Error::InputNotFound`].
+    /// [`StoreError::InputNotFound`].
     pub async fn delete_input(&self, name: &InputName) -> Result<(), Error> {
         self.inner.store.delete_input(name).await?;
         tracing::info!(input = %name, "input deleted");
@@ -159,7 +151,7 @@ impl Upload {
     /// Stores bytes at the end.
     ///
     /// # Errors
-    /// [`Error::TakenOver`] where another stream goes on with the upload, [`Error::UploadNotFound`] where it was given
+    /// [`StoreError::UploadTakenOver`] where another stream goes on with the upload, [`StoreError::UploadNotFound`] where it was given
     /// up, [`Error::Draining`] once they are stored.
     pub async fn append(&mut self, data: &[u8]) -> Result<(), Error> {
         let store = &self.engine.inner.store;
@@ -172,7 +164,7 @@ impl Upload {
     /// Some of the stored bytes from there on; none at the end.
     ///
     /// # Errors
-    /// [`Error::TakenOver`].
+    /// [`StoreError::UploadTakenOver`].
     pub async fn read(&self, at_byte: u64) -> Result<Vec<u8>, Error> {
         Ok(self.engine.inner.store.read_upload(&self.lease, at_byte).await?)
     }
@@ -180,7 +172,7 @@ impl Upload {
     /// Makes an input of the upload.
     ///
     /// # Errors
-    /// [`Error::TakenOver`], [`Error::UploadNotFound`].
+    /// [`StoreError::UploadTakenOver`], [`StoreError::UploadNotFound`].
     pub async fn finish(self, input: Input, sha256: [u8; 32]) -> Result<StoredInput, Error> {
         // Megabytes of arrays: not on a thread that serves others.
         let encode = move || {
@@ -204,7 +196,7 @@ impl Upload {
     /// Gives the upload up: its bytes are no input.
     ///
     /// # Errors
-    /// [`Error::TakenOver`], [`Error::UploadNotFound`].
+    /// [`StoreError::UploadTakenOver`], [`StoreError::UploadNotFound`].
     pub async fn give_up(self, reason: observe::GivenUp) -> Result<(), Error> {
         self.engine.inner.store.give_up_upload(&self.lease).await?;
         observe::uploads_given_up(reason, 1);

@@ -23,7 +23,6 @@ use super::origin::{self, Origin};
 use super::route::{self, Found, Route};
 use super::unique_keys::UniqueKeys;
 use super::{Options, console, download, grpc_web, openapi, upload};
-use crate::domain::Violation;
 use crate::domain::error::quoted;
 use crate::domain::job::JobState;
 use crate::rpc::caller::Tenant;
@@ -377,7 +376,7 @@ pub(super) fn failed(status: Status) -> Box<Answer> {
 
 /// What is wrong with a request that is no call yet.
 pub(super) fn invalid(field: &str, description: impl Into<String>) -> Box<Answer> {
-    answer::uncalled(HttpRefusal::Invalid, &status::invalid(&Violation::of(field, description.into()).into()))
+    answer::uncalled(HttpRefusal::Invalid, &status::violation(field, description))
 }
 
 /// Whether a job has ended and had its last event by then. A browser's `EventSource` asks again whenever its stream

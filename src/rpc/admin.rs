@@ -5,7 +5,7 @@ use tonic::{Request, Response, Status};
 use super::caller::Caller;
 use super::convert::count_to_wire;
 use super::convert::enums::Twin;
-use super::{proto, status};
+use super::proto;
 use crate::engine::{Engine, QueueReport, TenantQueue};
 
 /// Tenants that GetQueue lists, as the API says: those with most jobs.
@@ -23,7 +23,7 @@ impl Admin {
     }
 
     async fn queue(&self) -> Result<Response<proto::Queue>, Status> {
-        let report = self.engine.queue(MAX_TENANTS).await.map_err(status::from_engine)?;
+        let report = self.engine.queue(MAX_TENANTS).await?;
         Ok(Response::new(to_wire(report)))
     }
 }
@@ -36,7 +36,7 @@ impl proto::admin_service_server::AdminService for Admin {
 
     async fn pause_queue(&self, request: Request<proto::PauseQueueRequest>) -> Result<Response<proto::Queue>, Status> {
         let (caller, engine) = (Caller::of(&request)?, self.engine.clone());
-        let work = async move { engine.pause().await.map_err(status::from_engine) };
+        let work = async move { engine.pause().await };
         caller.audited("PauseQueue", "queue", work).await?;
         self.queue().await
     }
@@ -46,7 +46,7 @@ impl proto::admin_service_server::AdminService for Admin {
         request: Request<proto::ResumeQueueRequest>,
     ) -> Result<Response<proto::Queue>, Status> {
         let (caller, engine) = (Caller::of(&request)?, self.engine.clone());
-        let work = async move { engine.resume().await.map_err(status::from_engine) };
+        let work = async move { engine.resume().await };
         caller.audited("ResumeQueue", "queue", work).await?;
         self.queue().await
     }

@@ -58,7 +58,7 @@ impl Calibration {
         let Some(proto::SolveRequest { message: Some(proto::solve_request::Message::Config(config)) }) =
             next(&mut messages).await?
         else {
-            return Err(status::invalid(&super::violation("config", "is not the first message")));
+            return Err(status::violation("config", "is not the first message"));
         };
         permit.next_message();
         let mut submission = Submission::open(caller, config, &self.limits, permit)?;
@@ -76,7 +76,7 @@ impl Calibration {
         // detaches when the task's outcome is dropped.
         let stored = async move {
             let _permit = permit;
-            let stored = engine.submit(new).await.map_err(status::from_engine);
+            let stored = engine.submit(new).await.map_err(Status::from);
             caller.audit_jobs("Solve", stored.as_ref().map(std::slice::from_ref));
             stored.map(|job| disconnects.attached(job))
         };
@@ -133,7 +133,7 @@ impl proto::calibration_service_server::CalibrationService for Calibration {
             Ok::<_, Status>(call)
         };
         let mut call = accepted.instrument(span.clone()).await?;
-        let watch = call.watch().await.map_err(status::from_engine)?;
+        let watch = call.watch().await?;
         let watching = telemetry::metrics::watcher();
         let events = watch.into_stream().map(move |event| {
             let _ = &watching;
@@ -144,7 +144,7 @@ impl proto::calibration_service_server::CalibrationService for Calibration {
                 Err(_) => call.failed(),
                 _ => {}
             }
-            event.map(job::event_to_wire).map_err(status::from_engine)
+            event.map(job::event_to_wire).map_err(Status::from)
         });
         Ok(Response::new(Box::pin(events)))
     }

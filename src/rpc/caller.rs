@@ -6,9 +6,9 @@ use std::sync::Arc;
 use tonic::{Code, Request, Status};
 use tracing::Instrument;
 
+use super::meter::{CallRecord, code_name};
 use super::convert::names;
 use super::keys::{Grant, Scope};
-use super::meter::{CallRecord, code_name};
 use super::rates::Rates;
 use super::status;
 use crate::domain::InputName;
@@ -100,14 +100,14 @@ impl Caller {
     ///
     /// # Errors
     /// Those of `work`.
-    pub async fn audited<T: Send + 'static>(
+    pub async fn audited<T: Send + 'static, E: Into<Status>>(
         self,
         method: &'static str,
         resource: impl Display + Send + Sync + 'static,
-        work: impl Future<Output = Result<T, Status>> + Send + 'static,
+        work: impl Future<Output = Result<T, E>> + Send + 'static,
     ) -> Result<T, Status> {
         let doing = async move {
-            let outcome = work.await;
+            let outcome = work.await.map_err(Into::into);
             self.audit(method, &resource, &outcome);
             outcome
         };
@@ -144,7 +144,7 @@ impl Caller {
     /// # Errors
     /// `INVALID_ARGUMENT` for another form, `NOT_FOUND` for another tenant, whether there is one of that name or not.
     pub fn parent(&self, parent: &str) -> Result<String, Status> {
-        let tenant = names::tenant(parent, &self.tenant.id).map_err(|error| status::invalid(&error))?;
+        let tenant = names::tenant(parent, &self.tenant.id).map_err(status::invalid)?;
         if self.reaches(&tenant) { Ok(tenant) } else { Err(status::tenant_not_found(&tenant)) }
     }
 
@@ -153,7 +153,7 @@ impl Caller {
     /// # Errors
     /// `INVALID_ARGUMENT` for another form, `NOT_FOUND` for another tenant's.
     pub fn job(&self, name: &str) -> Result<JobName, Status> {
-        let name = names::job(name, &self.tenant.id).map_err(|error| status::invalid(&error))?;
+        let name = names::job(name, &self.tenant.id).map_err(status::invalid)?;
         if self.reaches(&name.tenant) { Ok(name) } else { Err(status::job_not_found(&name)) }
     }
 
@@ -163,7 +163,7 @@ impl Caller {
     /// # Errors
     /// `INVALID_ARGUMENT` for another form, `NOT_FOUND` for another tenant's.
     pub fn input(&self, name: &str, field: &str) -> Result<InputName, Status> {
-        let name = names::input(name, field, &self.tenant.id).map_err(|error| status::invalid(&error))?;
+        let name = names::input(name, field, &self.tenant.id).map_err(status::invalid)?;
         if self.reaches(&name.tenant) { Ok(name) } else { Err(status::input_not_found(&name)) }
     }
 }

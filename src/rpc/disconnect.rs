@@ -7,7 +7,7 @@ use std::time::Duration;
 use tokio::runtime::Handle;
 
 use crate::domain::job::{Job, JobName};
-use crate::engine::{self, Engine, Watch};
+use crate::engine::{self, Engine, StoreError, Watch};
 
 /// Cancels jobs that nobody waits for any more.
 #[derive(Debug, Clone)]
@@ -31,7 +31,7 @@ impl DisconnectTracker {
     async fn detach(self, job: Job, may_cancel: bool) {
         let left = match self.engine.detach(&job.name, job.create_time).await {
             Ok(left) => left,
-            Err(engine::Error::NotFound(_)) => return,
+            Err(engine::Error::Store(StoreError::NotFound(_))) => return,
             Err(error) => {
                 tracing::warn!(job = %job.name, %error, "cannot count a disconnected Solve; its job runs to its end");
                 return;
@@ -59,7 +59,7 @@ impl DisconnectTracker {
             match self.engine.cancel_as_of(name, Some(job.etag())).await {
                 Ok(_) => return tracing::info!(job = %name, "cancelled: every Solve that waited was disconnected"),
                 // It has changed between the two, and perhaps a call has attached.
-                Err(engine::Error::EtagMismatch(_)) => {}
+                Err(engine::Error::Store(StoreError::EtagMismatch(_))) => {}
                 Err(error) => return tracing::warn!(job = %name, %error, "cannot cancel a job that nobody waits for"),
             }
         }

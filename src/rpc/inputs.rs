@@ -11,9 +11,9 @@ use super::caller::Caller;
 use super::convert::{self, input, size_to_wire};
 use super::inflight::{Permit, WORKING_COPIES};
 use super::upload_reader::{self, UploadReader};
-use super::{proto, status, violation};
+use super::{proto, status};
 use crate::domain::{InputName, Limits};
-use crate::engine::{Begun, Engine, GivenUp, InputQuery, NewUpload, Upload};
+use crate::engine::{self, Begun, Engine, GivenUp, InputQuery, NewUpload, Upload};
 use proto::upload_input_request::Message;
 
 /// Data of one chunk, in bytes: below the message limit of every client and proxy.
@@ -55,7 +55,7 @@ impl Inputs {
         mut messages: Streaming<proto::UploadInputRequest>,
     ) -> Result<proto::Input, Status> {
         let Some(Message::Start(start)) = next(&mut messages, permit).await? else {
-            return Err(status::invalid(&violation("start", "is not the first message")));
+            return Err(status::violation("start", "is not the first message"));
         };
         let new = Self::read_start(caller, start)?;
         let name = new.name.clone();
@@ -72,7 +72,7 @@ impl Inputs {
         mut messages: Streaming<proto::UploadInputRequest>,
     ) -> Result<proto::Input, Status> {
         permit.hold(RECEPTION_BYTES)?;
-        let upload = match self.engine.begin_upload(new).await.map_err(status::from_engine)? {
+        let upload = match self.engine.begin_upload(new).await? {
             Begun::Finished(input) => return Ok(input::uploaded_to_wire(&input)),
             Begun::Open(upload) => upload,
         };
@@ -91,7 +91,7 @@ impl Inputs {
             Ok(bytes) if bytes > 0 => bytes,
             _ => {
                 let text = format!("{} is not a length in bytes, from 1 on", start.size_bytes);
-                return Err(status::invalid(&violation("start.size_bytes", text)));
+                return Err(status::violation("start.size_bytes", text));
             }
         };
         let sha256 = match start.sha256.is_empty() {
@@ -114,12 +114,12 @@ impl Inputs {
             let draft = convert::upload::read(&mut reader, &limits);
             let found = reader.into_hash()?;
             // Of bytes that are not those that were meant, nothing else is worth telling.
-            Ok((found, (found == sha256).then_some(draft)))
+            Ok::<_, engine::Error>((found, (found == sha256).then_some(draft)))
         });
         let (outcome, ()) = tokio::join!(decode, upload_reader::feed(&upload, sender));
-        let (found, draft) = outcome?.map_err(status::from_engine)?;
+        let (found, draft) = outcome??;
         let Some(draft) = draft else {
-            upload.give_up(GivenUp::WrongHash).await.map_err(status::from_engine)?;
+            upload.give_up(GivenUp::WrongHash).await?;
             return Err(status::hash_mismatch(sha256, found));
         };
         let input = match draft {
@@ -132,11 +132,11 @@ impl Inputs {
         };
         match input {
             Err(invalid) => {
-                upload.give_up(GivenUp::Invalid).await.map_err(status::from_engine)?;
-                Err(status::invalid(&invalid))
+                upload.give_up(GivenUp::Invalid).await?;
+                Err(status::invalid(invalid))
             }
             Ok(input) => {
-                let stored = upload.finish(input, found).await.map_err(status::from_engine)?;
+                let stored = upload.finish(input, found).await?;
                 Ok(input::uploaded_to_wire(&stored))
             }
         }
@@ -162,11 +162,11 @@ impl Reception {
                 Some(Message::Chunk(chunk)) => self.take(chunk).await?,
                 Some(Message::Finish(finish)) => return self.check_finish(&finish),
                 Some(Message::Start(_)) => {
-                    return Err(status::invalid(&violation("start", "comes once, in the first message")));
+                    return Err(status::violation("start", "comes once, in the first message"));
                 }
                 None => {
                     let text = format!("is missing: the stream ended at {}", self.progress());
-                    return Err(status::invalid(&violation("finish", text)));
+                    return Err(status::violation("finish", text));
                 }
             }
         }
@@ -181,7 +181,7 @@ impl Reception {
     }
 
     async fn take(&mut self, chunk: proto::UploadChunk) -> Result<(), Status> {
-        let invalid = |field: &str, text: String| Err(status::invalid(&violation(field, text)));
+        let invalid = |field: &str, text: String| Err(status::violation(field, text));
         let received = self.received();
         let length = chunk.data.len();
         if u64::try_from(chunk.offset) != Ok(received) {
@@ -210,7 +210,7 @@ impl Reception {
     }
 
     fn check_finish(&self, finish: &proto::UploadFinish) -> Result<[u8; 32], Status> {
-        let invalid = |field: &str, text: String| Err(status::invalid(&violation(field, text)));
+        let invalid = |field: &str, text: String| Err(status::violation(field, text));
         let sha256 = digest(&finish.sha256, "finish.sha256")?;
         if self.received() != self.upload.bytes() {
             return invalid("finish", format!("comes too early, at {}", self.progress()));
@@ -226,7 +226,7 @@ impl Reception {
         if gathered.is_empty() {
             return Ok(());
         }
-        self.upload.append(&gathered).await.map_err(status::from_engine)
+        Ok(self.upload.append(&gathered).await?)
     }
 }
 
@@ -239,7 +239,7 @@ async fn next(messages: &mut Streaming<proto::UploadInputRequest>, permit: &Perm
     match message {
         None => Ok(None),
         Some(proto::UploadInputRequest { message: Some(message) }) => Ok(Some(message)),
-        Some(_) => Err(status::invalid(&violation("message", "is not set"))),
+        Some(_) => Err(status::violation("message", "is not set")),
     }
 }
 
@@ -248,16 +248,12 @@ fn name(caller: &Caller, parent: &str, upload_id: &str, field: &str) -> Result<I
     let tenant = caller.parent(parent)?;
     match uuid::Uuid::try_parse(upload_id) {
         Ok(id) => Ok(InputName { tenant, input: id.hyphenated().to_string() }),
-        Err(_) => {
-            Err(status::invalid(&violation(field, "is not a UUID, such as 123e4567-e89b-42d3-a456-426614174000")))
-        }
+        Err(_) => Err(status::violation(field, "is not a UUID, such as 123e4567-e89b-42d3-a456-426614174000")),
     }
 }
 
 fn digest(bytes: &[u8], field: &str) -> Result<[u8; 32], Status> {
-    bytes
-        .try_into()
-        .map_err(|_| status::invalid(&violation(field, format!("{} bytes are not the 32 of a SHA-256", bytes.len()))))
+    bytes.try_into().map_err(|_| status::violation(field, format!("{} bytes are not the 32 of a SHA-256", bytes.len())))
 }
 
 #[tonic::async_trait]
@@ -282,7 +278,7 @@ impl proto::input_service_server::InputService for Inputs {
         let caller = Caller::of(&request)?;
         let request = request.into_inner();
         let name = name(&caller, &request.parent, &request.upload_id, "upload_id")?;
-        let found = self.engine.upload_status(&name).await.map_err(status::from_engine)?;
+        let found = self.engine.upload_status(&name).await?;
         Ok(Response::new(proto::UploadStatus {
             committed_bytes: size_to_wire(found.committed),
             input: found.input.as_ref().map(input::uploaded_to_wire),
@@ -297,10 +293,10 @@ impl proto::input_service_server::InputService for Inputs {
         let tenant = Caller::of(&request)?.parent(&request.get_ref().parent)?;
         let proto::ListInputsRequest { page_size, page_token, .. } = request.into_inner();
         let Ok(page_size) = u32::try_from(page_size) else {
-            return Err(status::invalid(&violation("page_size", format!("{page_size} is negative"))));
+            return Err(status::violation("page_size", format!("{page_size} is negative")));
         };
         let query = InputQuery { tenant, page_size, page_token: Some(page_token) };
-        let page = self.engine.list_inputs(&query).await.map_err(status::from_engine)?;
+        let page = self.engine.list_inputs(&query).await?;
         Ok(Response::new(proto::ListInputsResponse {
             inputs: page.inputs.iter().map(input::uploaded_to_wire).collect(),
             next_page_token: page.next_page_token.unwrap_or_default(),
@@ -311,7 +307,7 @@ impl proto::input_service_server::InputService for Inputs {
         let caller = Caller::of(&request)?;
         let name = caller.input(&request.get_ref().name, "name")?;
         let (engine, resource) = (self.engine.clone(), name.clone());
-        let delete = async move { engine.delete_input(&name).await.map_err(status::from_engine) };
+        let delete = async move { engine.delete_input(&name).await };
         caller.audited("DeleteInput", resource, delete).await.map(Response::new)
     }
 }

@@ -52,7 +52,7 @@ impl Jobs {
         let tenant = caller.parent(parent)?;
         if requests.is_empty() || requests.len() > MAX_BATCH {
             let text = format!("{} requests are not 1 to {MAX_BATCH}", requests.len());
-            return Err(status::invalid(&super::violation("requests", text)));
+            return Err(status::violation("requests", text));
         }
         let mut news = Vec::new();
         for (index, request) in requests.into_iter().enumerate() {
@@ -60,7 +60,7 @@ impl Jobs {
                 let of = names::tenant(&request.parent, &tenant);
                 if of.as_ref().is_ok_and(|of| *of != tenant) {
                     let text = format!("is neither left out nor the batch's tenants/{tenant}");
-                    return Err(status::invalid(&super::violation("parent", text)));
+                    return Err(status::violation("parent", text));
                 }
                 // In full: what is left out would be the caller's own tenant, and an administrator's may be another.
                 let parent = of.map_or(request.parent, |of| format!("tenants/{of}"));
@@ -81,13 +81,13 @@ impl Jobs {
         let engine = self.engine.clone();
         // In a task of its own: what is read is held to its end, also when the call is dropped.
         let reading = async move {
-            let summary = engine.job(&name).await.map_err(status::from_engine)?.summary;
+            let summary = engine.job(&name).await?.summary;
             let bytes = summary.map_or(0, |summary| summary.result_size_bytes);
             if bytes > largest {
                 return Err(status::result_too_large(&name, bytes, largest));
             }
             permit.hold(WORKING_COPIES.saturating_mul(bytes))?;
-            engine.result(&name).await.map_err(status::from_engine)
+            Ok(engine.result(&name).await?)
         };
         let read = tokio::spawn(reading.in_current_span()).await;
         read.map_err(|error| status::internal(&error))?
@@ -137,8 +137,7 @@ impl proto::job_service_server::JobService for Jobs {
             let submission = Submission::open(&caller, request.into_inner(), &self.limits, &permit)?;
             let trace_parent = telemetry::tracing::traceparent_to_store(&span, caller.trace_parent());
             let new = submission.close(trace_parent).await?;
-            let stored =
-                submission::store(&caller, "CreateJob", &self.engine, vec![new], permit, status::from_engine).await?;
+            let stored = submission::store(&caller, "CreateJob", &self.engine, vec![new], permit, Status::from).await?;
             let created =
                 stored.into_iter().next().ok_or_else(|| status::internal(&"one job was to be stored, none was"))?;
             telemetry::tracing::record_job(&span, &created.name);
@@ -160,7 +159,7 @@ impl proto::job_service_server::JobService for Jobs {
             let proto::BatchCreateJobsRequest { parent, requests } = request.into_inner();
             let trace_parent = telemetry::tracing::traceparent_to_store(&span, caller.trace_parent());
             let news = self.read_batch(&caller, &parent, requests, trace_parent, &permit).await?;
-            let refusal = status::from_engine_batch;
+            let refusal = status::of_batch;
             let created = submission::store(&caller, "BatchCreateJobs", &self.engine, news, permit, refusal).await?;
             Ok(Response::new(proto::BatchCreateJobsResponse { jobs: created.iter().map(job::to_wire).collect() }))
         };
@@ -169,7 +168,7 @@ impl proto::job_service_server::JobService for Jobs {
 
     async fn get_job(&self, request: Request<proto::GetJobRequest>) -> Result<Response<proto::Job>, Status> {
         let name = Caller::of(&request)?.job(&request.get_ref().name)?;
-        let found = self.engine.job(&name).await.map_err(status::from_engine)?;
+        let found = self.engine.job(&name).await?;
         Ok(Response::new(job::to_wire(&found)))
     }
 
@@ -178,11 +177,11 @@ impl proto::job_service_server::JobService for Jobs {
         request: Request<proto::ListJobsRequest>,
     ) -> Result<Response<proto::ListJobsResponse>, Status> {
         let tenant = Caller::of(&request)?.parent(&request.get_ref().parent)?;
-        let query = list::from_wire(tenant, request.into_inner()).map_err(|error| status::invalid(&error))?;
+        let query = list::from_wire(tenant, request.into_inner()).map_err(status::invalid)?;
         let Some(query) = query else {
             return Ok(Response::new(proto::ListJobsResponse::default()));
         };
-        let page = self.engine.list(&query).await.map_err(status::from_engine)?;
+        let page = self.engine.list(&query).await?;
         Ok(Response::new(proto::ListJobsResponse {
             jobs: page.jobs.iter().map(job::to_wire).collect(),
             next_page_token: page.next_page_token.unwrap_or_default(),
@@ -197,12 +196,12 @@ impl proto::job_service_server::JobService for Jobs {
     ) -> Result<Response<Self::WatchJobStream>, Status> {
         let name = Caller::of(&request)?.job(&request.get_ref().name)?;
         let after_sequence = request.get_ref().after_sequence;
-        let watch = self.engine.watch(&name, after_sequence).await.map_err(status::from_engine)?;
+        let watch = self.engine.watch(&name, after_sequence).await?;
         let watching = telemetry::metrics::watcher();
         let events = watch.into_stream().map(move |event| {
             // Counted for as long as the stream lives.
             let _ = &watching;
-            event.map(job::event_to_wire).map_err(status::from_engine)
+            event.map(job::event_to_wire).map_err(Status::from)
         });
         Ok(Response::new(Box::pin(events)))
     }
@@ -212,7 +211,7 @@ impl proto::job_service_server::JobService for Jobs {
         let name = caller.job(&request.get_ref().name)?;
         let etag = Some(request.into_inner().etag).filter(|etag| !etag.is_empty());
         let (engine, resource) = (self.engine.clone(), name.clone());
-        let cancel = async move { engine.cancel_as_of(&name, etag).await.map_err(status::from_engine) };
+        let cancel = async move { engine.cancel_as_of(&name, etag).await };
         let cancelled = caller.audited("CancelJob", resource, cancel).await?;
         Ok(Response::new(job::to_wire(&cancelled)))
     }
@@ -222,7 +221,7 @@ impl proto::job_service_server::JobService for Jobs {
         let name = caller.job(&request.get_ref().name)?;
         let etag = Some(request.into_inner().etag).filter(|etag| !etag.is_empty());
         let (engine, resource) = (self.engine.clone(), name.clone());
-        let delete = async move { engine.delete(&name, etag.as_deref()).await.map_err(status::from_engine) };
+        let delete = async move { engine.delete(&name, etag.as_deref()).await };
         caller.audited("DeleteJob", resource, delete).await.map(Response::new)
     }
 
@@ -234,7 +233,7 @@ impl proto::job_service_server::JobService for Jobs {
         let counted = caller.count_jobs(1);
         let retry = async move {
             counted?;
-            engine.retry(&name, etag).await.map_err(status::from_engine)
+            Ok::<_, Status>(engine.retry(&name, etag).await?)
         };
         let retried = caller.audited("RetryJob", resource, retry).await?;
         Ok(Response::new(job::to_wire(&retried)))
@@ -249,11 +248,10 @@ impl proto::job_service_server::JobService for Jobs {
         let proto::SetJobPriorityRequest { priority, etag, .. } = request.into_inner();
         let checked = convert::required(priority, "priority")
             .and_then(|priority| create::check_priority(priority, "priority").map(|()| priority));
-        let priority = checked.map_err(|found| status::invalid(&found.into()))?;
+        let priority = checked.map_err(status::invalid)?;
         let etag = Some(etag).filter(|etag| !etag.is_empty());
         let (engine, resource) = (self.engine.clone(), name.clone());
-        let change =
-            async move { engine.set_priority(&name, etag.as_deref(), priority).await.map_err(status::from_engine) };
+        let change = async move { engine.set_priority(&name, etag.as_deref(), priority).await };
         let changed = caller.audited("SetJobPriority", resource, change).await?;
         Ok(Response::new(job::to_wire(&changed)))
     }
@@ -282,7 +280,7 @@ impl proto::job_service_server::JobService for Jobs {
         let (encoded, sha256) = (Bytes::from(bytes), Bytes::copy_from_slice(&sha256));
         let Some(from) = usize::try_from(offset).ok().filter(|&from| from <= encoded.len()) else {
             let text = format!("{offset} is not within the {} bytes of the result", encoded.len());
-            return Err(status::invalid(&super::violation("offset", text)));
+            return Err(status::violation("offset", text));
         };
         let chunks = result_chunks(encoded, sha256, from).map(move |chunk| {
             // Held for as long as the stream lives.

@@ -27,13 +27,6 @@ mod upload_reader;
 
 use tonic::Status;
 
-use crate::domain::{InvalidInput, Violation};
-
-/// A single violation of a field of the request itself.
-fn violation(field: &str, description: impl Into<String>) -> InvalidInput {
-    Violation::of(field, description).into()
-}
-
 /// Runs what computes for long on a thread that serves no one else.
 async fn blocking<T: Send + 'static>(work: impl FnOnce() -> T + Send + 'static) -> Result<T, Status> {
     tokio::task::spawn_blocking(work).await.map_err(|error| status::internal(&error))

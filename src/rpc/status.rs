@@ -50,7 +50,7 @@ use tonic_types::{ErrorDetails, FieldViolation, StatusExt};
 use super::keys::Scope;
 use crate::domain::job::{JobName, JobState};
 use crate::domain::{InputName, InvalidInput, Oversize, Sha256Digest, Violation};
-use crate::engine::{self, TakenId};
+use crate::engine::{self, Bound, StoreError, TakenId};
 use crate::telemetry::metrics::RateBound;
 
 /// Domain of every `ErrorInfo`.
@@ -71,6 +71,9 @@ const MEMORY_RETRY: Duration = Duration::from_secs(2);
 
 /// Pause that a caller is told while the disk is full: somebody has to make room.
 const SPACE_RETRY: Duration = Duration::from_secs(60);
+
+/// Pause that a caller is told while the queue is full: about the time of one job.
+const QUEUE_RETRY: Duration = Duration::from_secs(3);
 
 /// Pause that a caller is told who has uploaded as much as it may: another upload takes about as long.
 const UPLOADS_RETRY: Duration = Duration::from_secs(60);
@@ -96,8 +99,14 @@ pub fn refused(code: Code, reason: &str, message: impl Into<String>) -> Status {
     status(code, reason, message, ErrorDetails::new())
 }
 
+/// A request that breaks a rule of a field.
+pub fn violation(field: &str, description: impl Into<String>) -> Status {
+    invalid(Violation::of(field, description))
+}
+
 /// A request that breaks rules.
-pub fn invalid(error: &InvalidInput) -> Status {
+pub fn invalid(error: impl Into<InvalidInput>) -> Status {
+    let error = error.into();
     let violations = error.violations();
     let listed = violations.len().min(SENTENCES_IN_MESSAGE);
     let mut message = violations[..listed].iter().map(Violation::to_string).collect::<Vec<_>>().join("; ");
@@ -248,87 +257,90 @@ pub fn internal(error: &dyn std::fmt::Display) -> Status {
     status(Code::Internal, "INTERNAL", "internal error; the server's log has the cause", ErrorDetails::new())
 }
 
-/// What the engine refuses.
-pub fn from_engine(error: engine::Error) -> Status {
+impl From<engine::Error> for Status {
+    /// What the engine refuses.
+    fn from(error: engine::Error) -> Self {
+        match error {
+            engine::Error::Store(error) => of_store(error),
+            engine::Error::JobTooLarge { oversize, .. } => too_large("JOB_TOO_LARGE", "job", &oversize),
+            engine::Error::InvalidArgument(error) => invalid(error),
+            engine::Error::NotReady(state) => {
+                let message = match state {
+                    JobState::Queued | JobState::Running => {
+                        format!("the job is {}; its result is not ready", state.name())
+                    }
+                    _ => format!("the job is {}; it has no result", state.name()),
+                };
+                status(Code::FailedPrecondition, "RESULT_NOT_READY", message, ErrorDetails::new())
+            }
+            engine::Error::Draining => {
+                let details = ErrorDetails::with_retry_info(Some(DRAINING_RETRY));
+                status(Code::Unavailable, "DRAINING", "the server is draining; try another or come back", details)
+            }
+            engine::Error::Internal(error) => internal(&error),
+        }
+    }
+}
+
+/// The same of a batch: the refusal of one request names it.
+pub fn of_batch(error: engine::Error) -> Status {
     match error {
-        engine::Error::NotFound(name) => job_not_found(&name),
-        engine::Error::InputNotFound(name) => input_not_found(&name),
-        engine::Error::UploadNotFound(name) => {
+        engine::Error::JobTooLarge { index, .. } => of_request(index, &error.into()),
+        _ => error.into(),
+    }
+}
+
+/// What the store refuses.
+fn of_store(error: StoreError) -> Status {
+    let told = |code, reason| status(code, reason, error.to_string(), ErrorDetails::new());
+    match &error {
+        StoreError::NotFound(name) => job_not_found(name),
+        StoreError::InputNotFound(name) => input_not_found(name),
+        StoreError::UploadNotFound(name) => {
             let message = format!("there is no upload {}: it was never begun, or was given up", name.input);
             status(Code::NotFound, "UPLOAD_NOT_FOUND", message, ErrorDetails::new())
         }
-        engine::Error::TakenOver(sentence) => status(Code::Aborted, "UPLOAD_TAKEN_OVER", sentence, ErrorDetails::new()),
-        engine::Error::UploadsFull { bound, message } => {
-            let metadata = HashMap::from([("bound".to_owned(), bound.to_owned())]);
-            let details = ErrorDetails::with_retry_info(Some(UPLOADS_RETRY));
-            status_with(Code::ResourceExhausted, "UPLOADS_FULL", metadata, message, details)
-        }
-        engine::Error::UploadTooLarge(oversize) => too_large("UPLOAD_TOO_LARGE", "start.size_bytes", &oversize),
-        engine::Error::BatchTooLarge(oversize) => too_large("BATCH_TOO_LARGE", "requests", &oversize),
-        engine::Error::JobTooLarge { oversize, .. } => too_large("JOB_TOO_LARGE", "job", &oversize),
-        engine::Error::AlreadyExists(taken) => {
-            let reason = match taken {
-                TakenId::Job(_) => "JOB_ID_TAKEN",
-                TakenId::Request(_) => "REQUEST_ID_REUSED",
-                TakenId::Upload(..) => "UPLOAD_ID_REUSED",
-            };
-            status(Code::AlreadyExists, reason, taken.to_string(), ErrorDetails::new())
-        }
-        engine::Error::QueueFull { retry_after, bound, message } => {
-            let metadata = HashMap::from([("bound".to_owned(), bound.to_owned())]);
-            let details = ErrorDetails::with_retry_info(Some(retry_after));
-            status_with(Code::ResourceExhausted, "QUEUE_FULL", metadata, message, details)
-        }
-        engine::Error::NotEnded(sentence) => {
-            status(Code::FailedPrecondition, "JOB_NOT_ENDED", sentence, ErrorDetails::new())
-        }
-        engine::Error::Succeeded(sentence) => {
-            status(Code::FailedPrecondition, "JOB_SUCCEEDED", sentence, ErrorDetails::new())
-        }
-        engine::Error::NotQueued(sentence) => {
-            status(Code::FailedPrecondition, "JOB_NOT_QUEUED", sentence, ErrorDetails::new())
-        }
-        engine::Error::EtagMismatch(sentence) => status(Code::Aborted, "ETAG_MISMATCH", sentence, ErrorDetails::new()),
-        engine::Error::InvalidArgument(error) => invalid(&error),
-        engine::Error::NotReady(state) => {
-            let message = match state {
-                JobState::Queued | JobState::Running => format!("the job is {}; its result is not ready", state.name()),
-                _ => format!("the job is {}; it has no result", state.name()),
-            };
-            status(Code::FailedPrecondition, "RESULT_NOT_READY", message, ErrorDetails::new())
-        }
-        engine::Error::Draining => {
-            let details = ErrorDetails::with_retry_info(Some(DRAINING_RETRY));
-            status(Code::Unavailable, "DRAINING", "the server is draining; try another or come back", details)
-        }
-        engine::Error::Unavailable(cause) => {
+        StoreError::UploadTakenOver(_) => told(Code::Aborted, "UPLOAD_TAKEN_OVER"),
+        StoreError::UploadsFull(bound) => full("UPLOADS_FULL", bound, UPLOADS_RETRY),
+        StoreError::QueueFull(bound) => full("QUEUE_FULL", bound, QUEUE_RETRY),
+        StoreError::UploadTooLarge(oversize) => too_large("UPLOAD_TOO_LARGE", "start.size_bytes", oversize),
+        StoreError::BatchTooLarge(oversize) => too_large("BATCH_TOO_LARGE", "requests", oversize),
+        StoreError::AlreadyExists(TakenId::Job(_)) => told(Code::AlreadyExists, "JOB_ID_TAKEN"),
+        StoreError::AlreadyExists(TakenId::Request(_)) => told(Code::AlreadyExists, "REQUEST_ID_REUSED"),
+        StoreError::AlreadyExists(TakenId::Upload(..)) => told(Code::AlreadyExists, "UPLOAD_ID_REUSED"),
+        StoreError::NotEnded(..) => told(Code::FailedPrecondition, "JOB_NOT_ENDED"),
+        StoreError::Succeeded(_) => told(Code::FailedPrecondition, "JOB_SUCCEEDED"),
+        StoreError::NotQueued(..) => told(Code::FailedPrecondition, "JOB_NOT_QUEUED"),
+        StoreError::EtagMismatch(_) => told(Code::Aborted, "ETAG_MISMATCH"),
+        StoreError::PageToken => violation("page_token", error.to_string()),
+        StoreError::Unavailable(cause) => {
             // The cause names hosts and users: it is for the log.
             tracing::warn!(%cause, "the store is out of reach");
             let details = ErrorDetails::with_retry_info(Some(STORE_RETRY));
             status(Code::Unavailable, "STORE_UNAVAILABLE", "the store is out of reach; come back soon", details)
         }
-        engine::Error::NoSpace(cause) => {
+        StoreError::NoSpace(cause) => {
             // The cause may name paths: it is for the log.
             tracing::error!(%cause, "no space is left for the store");
             let details = ErrorDetails::with_retry_info(Some(SPACE_RETRY));
             let message = "no space is left for the store: nothing was stored; whoever runs the server must make room";
             status(Code::ResourceExhausted, "STORE_FULL", message, details)
         }
-        engine::Error::Internal(error) => internal(&error),
+        StoreError::Fenced(_) | StoreError::InUse(_) | StoreError::Corrupt(_) => internal(&error),
     }
 }
 
-/// The same of a batch: the refusal of one request names it.
-pub fn from_engine_batch(error: engine::Error) -> Status {
-    match error {
-        engine::Error::JobTooLarge { index, .. } => of_request(index, &from_engine(error)),
-        _ => from_engine(error),
-    }
+/// A bound that refuses more for now.
+fn full(reason: &str, bound: &Bound, retry: Duration) -> Status {
+    let metadata = HashMap::from([("bound".to_owned(), bound.quota.name().to_owned())]);
+    let details = ErrorDetails::with_retry_info(Some(retry));
+    status_with(Code::ResourceExhausted, reason, metadata, bound.to_string(), details)
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::domain::Quota;
     use crate::domain::error::Violations;
 
     #[test]
@@ -337,7 +349,7 @@ mod tests {
         for k in 0..30 {
             found.push(Violation::at("track_set.xs", k, "NaN is not a finite number"));
         }
-        let status = invalid(&found.into_result().expect_err("30 violations"));
+        let status = invalid(found.into_result().expect_err("30 violations"));
         assert_eq!(status.code(), Code::InvalidArgument);
         assert!(status.message().starts_with("track_set.xs[0]: NaN is not a finite number; "), "{}", status.message());
         assert!(status.message().ends_with("; and 27 more like this"), "{}", status.message());
@@ -350,11 +362,8 @@ mod tests {
 
     #[test]
     fn a_full_queue_says_when_to_come_back() {
-        let status = from_engine(engine::Error::QueueFull {
-            retry_after: Duration::from_secs(3),
-            bound: "jobs",
-            message: "256 jobs wait already".into(),
-        });
+        let bound = Bound { quota: Quota::Jobs, taken: 256, asked: 1, max: 256 };
+        let status = Status::from(engine::Error::from(StoreError::QueueFull(bound)));
         assert_eq!(status.code(), Code::ResourceExhausted);
         let retry = status.get_details_retry_info().expect("a RetryInfo");
         assert_eq!(retry.retry_delay, Some(Duration::from_secs(3)));
@@ -364,15 +373,15 @@ mod tests {
 
     #[test]
     fn what_never_fits_is_no_matter_of_time() {
-        use crate::domain::Quota;
         let oversize = |quota| Oversize { quota, asked: 9, max: 8 };
-        let of_batch = Quota::OF_QUEUE.map(|quota| (quota, engine::Error::BatchTooLarge(oversize(quota)), "requests"));
+        let of_batch =
+            Quota::OF_QUEUE.map(|quota| (quota, StoreError::BatchTooLarge(oversize(quota)).into(), "requests"));
         let of_upload = [Quota::UploadBytes, Quota::TenantUploadBytes]
-            .map(|quota| (quota, engine::Error::UploadTooLarge(oversize(quota)), "start.size_bytes"));
+            .map(|quota| (quota, StoreError::UploadTooLarge(oversize(quota)).into(), "start.size_bytes"));
         let too_large = engine::Error::JobTooLarge { index: 0, oversize: oversize(Quota::SolverBytes) };
         let of_job = (Quota::SolverBytes, too_large, "job");
         for (quota, error, field) in of_batch.into_iter().chain(of_upload).chain([of_job]) {
-            let status = from_engine(error);
+            let status = Status::from(error);
             assert_eq!(status.code(), Code::InvalidArgument);
             assert!(status.get_details_retry_info().is_none(), "{status:?}");
             let (name, key) = (quota.name(), quota.key());
@@ -387,7 +396,7 @@ mod tests {
 
     #[test]
     fn a_store_that_is_away_is_worth_another_try_and_its_address_stays_inside() {
-        let status = from_engine(engine::Error::Unavailable("no route to db.internal".into()));
+        let status = of_store(StoreError::Unavailable("no route to db.internal".into()));
         assert_eq!(status.code(), Code::Unavailable);
         assert!(!status.message().contains("db.internal"), "{}", status.message());
         assert!(status.get_details_retry_info().is_some_and(|retry| retry.retry_delay.is_some()));
@@ -396,11 +405,19 @@ mod tests {
 
     #[test]
     fn a_full_disk_is_told_and_its_path_stays_inside() {
-        let status = from_engine(engine::Error::NoSpace("/srv/secret is full".into()));
+        let status = of_store(StoreError::NoSpace("/srv/secret is full".into()));
         assert_eq!(status.code(), Code::ResourceExhausted);
         assert!(!status.message().contains("secret"), "{}", status.message());
         assert!(status.get_details_retry_info().is_some_and(|retry| retry.retry_delay.is_some()));
         assert_eq!(status.get_details_error_info().expect("an ErrorInfo").reason, "STORE_FULL");
+    }
+
+    #[test]
+    fn a_page_token_of_another_query_names_its_field() {
+        let status = of_store(StoreError::PageToken);
+        assert_eq!(status.code(), Code::InvalidArgument);
+        let request = status.get_details_bad_request().expect("a BadRequest");
+        assert_eq!(request.field_violations[0].field, "page_token");
     }
 
     #[test]

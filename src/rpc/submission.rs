@@ -10,7 +10,7 @@ use super::convert::input::Draft;
 use super::inflight::{Permit, WORKING_COPIES};
 use super::{proto, status};
 use crate::domain::job::Job;
-use crate::domain::{InputName, InvalidInput, Limits};
+use crate::domain::{InputName, InvalidInput, Limits, Violation};
 use crate::engine::{self, Engine, JobInput, NewJob};
 use crate::telemetry::metrics::{Refusal, refused};
 use proto::create_job_request::Source as Inline;
@@ -44,11 +44,10 @@ impl Submission {
         permit: &Permit,
     ) -> Result<Self, Status> {
         let tenant = caller.parent(&request.parent)?;
-        let description =
-            create::from_wire(request.job_id, request.request_id, request.job).map_err(|error| invalid(&error))?;
+        let description = create::from_wire(request.job_id, request.request_id, request.job).map_err(invalid)?;
         let input = match request.source {
             Some(Inline::Input(name)) => Source::Uploaded(caller.input(&name, "input")?),
-            input => Source::Draft(Draft::begin(input, limits).map_err(|error| invalid(&error))?),
+            input => Source::Draft(Draft::begin(input, limits).map_err(invalid)?),
         };
         let permit = permit.clone();
         let mut submission = Self { tenant, description, input, permit, charged_bytes: 0 };
@@ -65,8 +64,8 @@ impl Submission {
     pub fn append(&mut self, message: proto::SolveRequest) -> Result<(), Status> {
         use proto::solve_request::Message;
         match (message.message, &mut self.input) {
-            (Some(Message::Config(_)), _) => Err(super::violation("config", "comes once, in the first message")),
-            (None, _) => Err(super::violation("message", "is not set")),
+            (Some(Message::Config(_)), _) => Err(Violation::of("config", "comes once, in the first message").into()),
+            (None, _) => Err(Violation::of("message", "is not set").into()),
             (Some(Message::TrackSetChunk(chunk)), Source::Draft(draft)) => draft.append_track_set(chunk),
             (Some(Message::MeasurementMatrixChunk(chunk)), Source::Draft(draft)) => draft.append_matrix(chunk),
             (Some(Message::MatchSetChunk(chunk)), Source::Draft(draft)) => draft.append_match_set(chunk),
@@ -78,10 +77,10 @@ impl Submission {
                     // Refused above.
                     Message::Config(_) => "config",
                 };
-                Err(super::violation(field, "the config names an uploaded input"))
+                Err(Violation::of(field, "the config names an uploaded input").into())
             }
         }
-        .map_err(|error| invalid(&error))?;
+        .map_err(invalid)?;
         self.check_size()?;
         self.permit.next_message();
         self.charge(1)
@@ -104,7 +103,7 @@ impl Submission {
                     draft.finish()
                 };
                 let checked = super::blocking(finish).await?;
-                JobInput::Inline(checked.map_err(|error| invalid(&error))?)
+                JobInput::Inline(checked.map_err(invalid)?)
             }
         };
         let mut job = NewJob::new(tenant, input, description.settings);
@@ -131,7 +130,7 @@ impl Submission {
         let Source::Draft(draft) = &self.input else { return Ok(()) };
         draft.check_size().map_err(|error| {
             refused(Refusal::TooLarge);
-            status::invalid(&error)
+            status::invalid(error)
         })
     }
 }
@@ -161,7 +160,7 @@ pub async fn store(
     tokio::spawn(storing.in_current_span()).await.map_err(|error| status::internal(&error))?
 }
 
-fn invalid(error: &InvalidInput) -> Status {
+fn invalid(error: InvalidInput) -> Status {
     refused(Refusal::Invalid);
     status::invalid(error)
 }

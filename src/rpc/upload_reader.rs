@@ -136,7 +136,7 @@ mod tests {
 
     #[test]
     fn bytes_that_cannot_be_read_end_the_reading() {
-        let away = Error::Unavailable("away".into());
+        let away = Error::Internal("away".into());
         let mut reader = reader(&[1; 100], 30, Some(away.clone()));
         let mut read = vec![9; 101];
         reader.copy_to_slice(&mut read);

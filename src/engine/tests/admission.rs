@@ -1,22 +1,20 @@
 //! What is taken on and what is refused.
 
 use super::*;
-use crate::engine::{Error, JobQuery};
+use crate::engine::{Error, JobQuery, StoreError};
 use crate::store::TakenId;
 
 #[tokio::test]
 async fn a_full_queue_refuses_at_once_and_takes_on_again() {
     let mut options = workers(1);
     options.queue.max_jobs = 1;
-    options.retry_after = Duration::from_secs(17);
     let test = TestEngine::start(options).await;
     test.submit(Behavior::Wait).await;
     test.solver.until_waiting(1).await;
     let waiting = test.submit(Behavior::Wait).await;
     match test.engine.submit(new_job(Behavior::Wait)).await {
-        Err(Error::QueueFull { retry_after, bound, message }) => {
-            assert_eq!((retry_after, bound), (Duration::from_secs(17), "jobs"));
-            assert_eq!(message, "the queue is full: jobs waiting: 1, asked for: 1, allowed: 1");
+        Err(Error::Store(StoreError::QueueFull(bound))) => {
+            assert_eq!(bound.to_string(), "the queue is full: jobs waiting: 1, asked for: 1, allowed: 1");
         }
         other => panic!("{other:?}"),
     }
@@ -45,7 +43,7 @@ async fn one_request_is_one_job_however_often_it_is_sent() {
         NewJob { job_id: Some("mine".into()), ..request(Behavior::Succeed) },
         NewJob { deadline: Some(crate::engine::Deadline::After(Duration::from_secs(1))), ..request(Behavior::Succeed) },
     ] {
-        assert!(matches!(test.engine.submit(other).await, Err(Error::AlreadyExists(_))));
+        assert!(matches!(test.engine.submit(other).await, Err(Error::Store(StoreError::AlreadyExists(_)))));
     }
     assert_eq!(test.solver.calls.load(Ordering::SeqCst), 1);
     assert_eq!(test.engine.list(&JobQuery::default()).await.expect("lists").jobs.len(), 1);
@@ -83,13 +81,16 @@ async fn job_ids_are_the_callers_or_made() {
     let job = test.engine.submit(mine()).await.expect("admitted");
     assert_eq!(job.name.to_string(), "tenants/default/jobs/mine");
     let taken = test.engine.submit(mine()).await.expect_err("taken");
-    assert_eq!(taken, Error::AlreadyExists(TakenId::Job(JobName { tenant: "default".into(), job: "mine".into() })));
+    assert_eq!(
+        taken,
+        StoreError::AlreadyExists(TakenId::Job(JobName { tenant: "default".into(), job: "mine".into() })).into()
+    );
     let made = test.submit(Behavior::Succeed).await;
     assert!(JobName::parse(&made.to_string()).is_some(), "{made}");
     let missing = JobName { tenant: "other".into(), job: "mine".into() };
-    assert_eq!(test.engine.job(&missing).await, Err(Error::NotFound(missing.clone())));
-    assert_eq!(test.engine.cancel(&missing).await, Err(Error::NotFound(missing.clone())));
-    assert_eq!(test.engine.watch(&missing, 0).await.map(|_| ()), Err(Error::NotFound(missing)));
+    assert_eq!(test.engine.job(&missing).await, Err(StoreError::NotFound(missing.clone()).into()));
+    assert_eq!(test.engine.cancel(&missing).await, Err(StoreError::NotFound(missing.clone()).into()));
+    assert_eq!(test.engine.watch(&missing, 0).await.map(|_| ()), Err(StoreError::NotFound(missing).into()));
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]

@@ -5,7 +5,7 @@ use std::time::{Duration, SystemTime};
 use tokio::runtime::Runtime;
 
 use super::*;
-use crate::engine::{Drained, Error, StoreState, locked};
+use crate::engine::{Drained, Error, Phase, StoreError, StoreState, locked};
 use crate::store::Claim;
 
 #[tokio::test]
@@ -16,7 +16,7 @@ async fn a_drain_lets_what_runs_finish_and_leaves_what_waits() {
     let queued = test.submit(Behavior::Wait).await;
     let engine = test.engine.clone();
     let drain = tokio::spawn(async move { engine.drain(Duration::from_secs(120)).await });
-    eventually(|| async { test.engine.is_draining().then_some(()) }).await;
+    eventually(|| async { (test.engine.inner.phase() != Phase::Open).then_some(()) }).await;
     assert_eq!(test.engine.submit(new_job(Behavior::Wait)).await, Err(Error::Draining));
     test.solver.release();
     assert_eq!(drain.await.expect("no panic"), Drained { finished: 1, given_back: 0 });
@@ -36,7 +36,7 @@ async fn interrupt_running_ends_the_wait_of_a_drain() {
         }
         let engine = test.engine.clone();
         let drain = tokio::spawn(async move { engine.drain(Duration::from_secs(3600)).await });
-        eventually(|| async { test.engine.is_draining().then_some(()) }).await;
+        eventually(|| async { (test.engine.inner.phase() != Phase::Open).then_some(()) }).await;
         if !before {
             test.engine.interrupt_running();
         }
@@ -66,7 +66,7 @@ async fn those_who_follow_the_store_hear_of_changes_alone() {
     let in_the_way = test.directory.path().join("scpsfm.reserve.new");
     std::fs::create_dir(&in_the_way).expect("a folder");
     test.store.find_no_room().await;
-    assert!(matches!(test.engine.submit(new_job(Behavior::Succeed)).await, Err(Error::NoSpace(_))));
+    assert!(matches!(test.engine.submit(new_job(Behavior::Succeed)).await, Err(Error::Store(StoreError::NoSpace(_)))));
     look().await;
     assert_eq!(*states.borrow_and_update(), StoreState::Full);
     look().await;
@@ -388,7 +388,7 @@ async fn without_a_store_for_a_lease_the_work_stops_and_later_goes_on_by_itself(
     test.store.execute(NO_WRITES).await;
     eventually(|| async { locked(&test.engine.inner.running).is_empty().then_some(()) }).await;
     assert_eq!(test.engine.job(&name).await.expect("reads work").state, JobState::Running, "as far as is known");
-    assert!(matches!(test.engine.submit(new_job(Behavior::Wait)).await, Err(Error::Unavailable(_))));
+    assert!(matches!(test.engine.submit(new_job(Behavior::Wait)).await, Err(Error::Store(StoreError::Unavailable(_)))));
     test.store.execute(MENDED).await;
     test.solver.release();
     let job = test.ended(&name).await;

@@ -225,7 +225,7 @@ async fn a_job_of_a_batch_that_takes_too_much_memory_is_named() {
 /// Fills a queue of these bounds until it refuses, by `bound`.
 async fn fills_up(queue: QueueBounds, bound: &str) {
     let (solver, hold) = held();
-    let engine = engine::Options { queue, retry_after: Duration::from_secs(7), ..one_worker() };
+    let engine = engine::Options { queue, ..one_worker() };
     let server = TestServer::start_with(solver, Options::default(), engine).await;
     let mut jobs = server.jobs().await;
     let first = created(&mut jobs, create_tracks()).await.name;
@@ -234,7 +234,7 @@ async fn fills_up(queue: QueueBounds, bound: &str) {
     let status = jobs.create_job(create_tracks()).await.expect_err("a full queue");
     assert_eq!(status.code(), Code::ResourceExhausted, "{status}");
     let retry = status.get_details_retry_info().expect("a RetryInfo");
-    assert_eq!(retry.retry_delay, Some(Duration::from_secs(7)));
+    assert_eq!(retry.retry_delay, Some(Duration::from_secs(3)));
     let info = status.get_details_error_info().expect("an ErrorInfo");
     assert_eq!(info.reason, "QUEUE_FULL");
     assert_eq!(info.metadata, HashMap::from([("bound".to_owned(), bound.to_owned())]));

@@ -11,7 +11,7 @@ use super::server::Server;
 use crate::domain::SolveSettings;
 use crate::domain::job::{EventBody, JobName, JobState};
 use crate::engine::tests::input;
-use crate::engine::{Engine, Error, NewJob};
+use crate::engine::{Engine, Error, NewJob, StoreError};
 
 /// Jobs that clients ask for in one simulation at most.
 const MOST_REQUESTS: u64 = 24;
@@ -151,7 +151,7 @@ pub(super) fn request(number: u64) -> NewJob {
 
 /// What may be answered by a server whose store misbehaves.
 fn is_failure(error: &Error) -> bool {
-    matches!(error, Error::Unavailable(_) | Error::NoSpace(_) | Error::Draining)
+    matches!(error, Error::Store(StoreError::Unavailable(_) | StoreError::NoSpace(_)) | Error::Draining)
 }
 
 async fn submit(engine: Engine, number: u64, history: Arc<Mutex<History>>) {
@@ -164,7 +164,7 @@ async fn submit(engine: Engine, number: u64, history: Arc<Mutex<History>>) {
             }
             history.jobs.entry(job.name).or_default();
         }
-        Err(Error::QueueFull { .. }) => {}
+        Err(Error::Store(StoreError::QueueFull(_))) => {}
         Err(error) if is_failure(&error) => {}
         Err(error) => history.violated(format!("request {number}: {error}")),
     }
@@ -174,7 +174,8 @@ async fn cancel(engine: Engine, name: JobName, history: Arc<Mutex<History>>) {
     match engine.cancel(&name).await {
         Ok(_) => {}
         Err(error) if is_failure(&error) => {}
-        Err(Error::NotFound(_)) if locked(&history).jobs.get(&name).is_none_or(|known| known.deleted) => {}
+        Err(Error::Store(StoreError::NotFound(_)))
+            if locked(&history).jobs.get(&name).is_none_or(|known| known.deleted) => {}
         Err(error) => locked(&history).violated(format!("cancel of {name}: {error}")),
     }
 }
@@ -190,7 +191,7 @@ async fn delete(engine: Engine, name: JobName, history: Arc<Mutex<History>>) {
     }
     match engine.delete(&name, None).await {
         // A request that was on its way for long has made the job anew.
-        Ok(()) | Err(Error::NotFound(_) | Error::NotEnded(_)) => {}
+        Ok(()) | Err(Error::Store(StoreError::NotFound(_) | StoreError::NotEnded(..))) => {}
         Err(error) if is_failure(&error) => {}
         Err(error) => locked(&history).violated(format!("delete of {name}: {error}")),
     }
@@ -207,7 +208,7 @@ async fn retry(engine: Engine, name: JobName, history: Arc<Mutex<History>>) {
     }
     match engine.retry(&name, None).await {
         // Another client may have retried it, or deleted it.
-        Ok(_) | Err(Error::NotFound(_) | Error::QueueFull { .. } | Error::Succeeded(_)) => {}
+        Ok(_) | Err(Error::Store(StoreError::NotFound(_) | StoreError::QueueFull(_) | StoreError::Succeeded(_))) => {}
         Err(error) if is_failure(&error) => {}
         Err(error) => locked(&history).violated(format!("retry of {name}: {error}")),
     }
@@ -215,9 +216,10 @@ async fn retry(engine: Engine, name: JobName, history: Arc<Mutex<History>>) {
 
 async fn set_priority(engine: Engine, name: JobName, priority: i32, history: Arc<Mutex<History>>) {
     match engine.set_priority(&name, None, priority).await {
-        Ok(_) | Err(Error::NotQueued(..)) => {}
+        Ok(_) | Err(Error::Store(StoreError::NotQueued(..))) => {}
         Err(error) if is_failure(&error) => {}
-        Err(Error::NotFound(_)) if locked(&history).jobs.get(&name).is_none_or(|known| known.deleted) => {}
+        Err(Error::Store(StoreError::NotFound(_)))
+            if locked(&history).jobs.get(&name).is_none_or(|known| known.deleted) => {}
         Err(error) => locked(&history).violated(format!("priority of {name}: {error}")),
     }
 }
