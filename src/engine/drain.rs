@@ -1,11 +1,10 @@
 //! Hiring the workers at the start, and letting them go at the end.
 
 use std::sync::Arc;
-use std::thread;
 use std::time::Duration;
 
 use tokio::sync::mpsc;
-use tokio::task::JoinHandle;
+use tokio::task::JoinSet;
 use tokio::time::timeout;
 
 use super::worker::Worker;
@@ -27,13 +26,10 @@ pub struct Drained {
 /// Those who work for an engine, and what they did since its drain began.
 #[derive(Debug, Default)]
 pub(super) struct WorkerPool {
-    slots: Vec<JoinHandle<()>>,
-    sweeper: Option<JoinHandle<()>>,
-    /// Handles the notifications of other processes, where there are any.
-    notifications: Option<JoinHandle<()>>,
-    /// Delivers webhooks, where they are on.
-    webhooks: Option<JoinHandle<()>>,
-    threads: Vec<thread::JoinHandle<()>>,
+    /// The slots of the workers.
+    slots: JoinSet<()>,
+    /// What else runs beside them: the sweeper, the handler of notifications, the sender of webhooks.
+    others: JoinSet<()>,
     /// Closes when the last thread has ended.
     threads_ended: Option<mpsc::Receiver<()>>,
     drained: Drained,
@@ -42,7 +38,6 @@ pub(super) struct WorkerPool {
 /// Worker threads that nobody feeds yet.
 pub(super) struct Threads {
     pub workers: Vec<Worker>,
-    pub threads: Vec<thread::JoinHandle<()>>,
     /// Closes when the last thread has ended.
     pub ended: mpsc::Receiver<()>,
 }
@@ -55,23 +50,23 @@ impl Threads {
             Worker::start(index, solver.clone(), encode, alive.clone())
                 .map_err(|error| Error::Internal(format!("cannot start worker thread {index}: {error}")))
         };
-        let (workers, threads) = (0..count).map(start).collect::<Result<Vec<_>, _>>()?.into_iter().unzip();
-        Ok(Self { workers, threads, ended })
+        Ok(Self { workers: (0..count).map(start).collect::<Result<_, _>>()?, ended })
     }
 }
 
 impl Inner {
     /// Starts the slots of these workers and the sweeper.
     pub(super) fn hire(self: &Arc<Self>, threads: Threads) -> Result<(), Error> {
-        let Threads { workers, threads, ended } = threads;
-        let mut pool = WorkerPool { threads, threads_ended: Some(ended), ..WorkerPool::default() };
-        pool.slots = workers.into_iter().map(|worker| tokio::spawn(slot::run(self.clone(), worker))).collect();
-        pool.sweeper = Some(tokio::spawn(slot::sweep(self.clone())));
+        let mut pool = WorkerPool { threads_ended: Some(threads.ended), ..WorkerPool::default() };
+        for worker in threads.workers {
+            pool.slots.spawn(slot::run(self.clone(), worker));
+        }
+        pool.others.spawn(slot::sweep(self.clone()));
         if self.store.is_shared() {
-            pool.notifications = Some(tokio::spawn(super::notifications::run(self.clone())));
+            pool.others.spawn(super::notifications::run(self.clone()));
         }
         if let Some(options) = &self.options.webhooks {
-            pool.webhooks = Some(webhooks::start(self, options).map_err(Error::Internal)?);
+            pool.others.spawn(webhooks::task(self, options).map_err(Error::Internal)?);
         }
         *locked(&self.pool) = pool;
         Ok(())
@@ -100,11 +95,9 @@ impl Inner {
         if !begun {
             return Drained::default();
         }
-        let (mut slots, others, threads, threads_ended) = {
+        let (mut slots, mut others, threads_ended) = {
             let mut pool = locked(&self.pool);
-            let slots = std::mem::take(&mut pool.slots);
-            let others = [pool.sweeper.take(), pool.notifications.take(), pool.webhooks.take()];
-            (slots, others, std::mem::take(&mut pool.threads), pool.threads_ended.take())
+            (std::mem::take(&mut pool.slots), std::mem::take(&mut pool.others), pool.threads_ended.take())
         };
         let in_time = timeout(bound, all_ended(&mut slots));
         if !matches!(self.interrupted.run_until_cancelled(in_time).await, Some(Ok(()))) {
@@ -116,40 +109,28 @@ impl Inner {
             if timeout(GIVE_BACK_GRACE, all_ended(&mut slots)).await.is_err() {
                 // Their leases run out, or are taken back at the next start.
                 tracing::warn!("jobs did not stop within {GIVE_BACK_GRACE:?}, their leases are left behind");
-                slots.iter().for_each(JoinHandle::abort);
+                slots.abort_all();
             }
         }
         self.phase.send_replace(Phase::Closed);
-        let mut others: Vec<JoinHandle<()>> = others.into_iter().flatten().collect();
-        let (others_ended, ()) =
-            tokio::join!(timeout(GIVE_BACK_GRACE, all_ended(&mut others)), join(threads, threads_ended));
-        if others_ended.is_err() {
-            // They wait for a store or a receiver that hangs, and have nothing that another server or the next start
-            // would miss.
-            others.iter().for_each(JoinHandle::abort);
-        }
+        // Those that outlast this wait for a store or a receiver that hangs, and have nothing that another server or the
+        // next start would miss.
+        let others_ended = timeout(GIVE_BACK_GRACE, all_ended(&mut others));
+        let _ = tokio::join!(others_ended, threads_end(threads_ended));
         locked(&self.pool).drained
     }
 }
 
 /// Waits for the tasks that are left; dropping the future keeps those that have not ended.
-async fn all_ended(tasks: &mut Vec<JoinHandle<()>>) {
-    while let Some(task) = tasks.last_mut() {
-        // One ends early only by a panic, which has been reported; the lease of a slot runs out.
-        let _ = task.await;
-        tasks.pop();
-    }
+async fn all_ended(tasks: &mut JoinSet<()>) {
+    // One ends early only by a panic, which has been reported; the lease of a slot runs out.
+    while tasks.join_next().await.is_some() {}
 }
 
-/// Joins the worker threads; one that does not stop is left to the end of the process.
-async fn join(threads: Vec<thread::JoinHandle<()>>, ended: Option<mpsc::Receiver<()>>) {
+/// Waits for the worker threads; one that does not stop is left to the end of the process.
+async fn threads_end(ended: Option<mpsc::Receiver<()>>) {
     let Some(mut ended) = ended else { return };
     if timeout(GIVE_BACK_GRACE, ended.recv()).await.is_err() {
         tracing::warn!("a worker thread does not stop");
-        return;
-    }
-    for thread in threads {
-        // Panics of the solver are caught inside.
-        let _ = thread.join();
     }
 }

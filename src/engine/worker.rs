@@ -95,16 +95,15 @@ impl Worker {
         solver: Solver,
         encode: ResultEncoder,
         alive: mpsc::Sender<()>,
-    ) -> std::io::Result<(Self, thread::JoinHandle<()>)> {
+    ) -> std::io::Result<Self> {
         let (assignments, mut inbox) = mpsc::channel::<Assigned>(1);
-        let handle =
-            thread::Builder::new().name(format!("solver-{index}")).stack_size(STACK_BYTES).spawn(move || {
-                let _alive = alive;
-                while let Some(assigned) = inbox.blocking_recv() {
-                    work(assigned, &solver, encode);
-                }
-            })?;
-        Ok((Self { assignments }, handle))
+        thread::Builder::new().name(format!("solver-{index}")).stack_size(STACK_BYTES).spawn(move || {
+            let _alive = alive;
+            while let Some(assigned) = inbox.blocking_recv() {
+                work(assigned, &solver, encode);
+            }
+        })?;
+        Ok(Self { assignments })
     }
 
     /// Feeds who reads from the inbox.

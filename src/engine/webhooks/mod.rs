@@ -11,7 +11,7 @@ use std::collections::{BTreeMap, HashMap};
 use std::sync::Arc;
 use std::time::Duration;
 
-use tokio::task::{Id, JoinHandle, JoinSet};
+use tokio::task::{Id, JoinSet};
 use tokio::time::sleep;
 
 pub use signature::Secrets;
@@ -77,13 +77,13 @@ pub(super) fn check(options: Option<&Options>, tenant: &str, url: &str) -> Resul
     checked.map_err(|error| Violation::of("job.webhook.url", error).into())
 }
 
-/// Starts the task that delivers.
+/// The task that delivers.
 ///
 /// # Errors
 /// As [`Sender::new`].
-pub(super) fn start(inner: &Arc<Inner>, options: &Options) -> Result<JoinHandle<()>, String> {
+pub(super) fn task(inner: &Arc<Inner>, options: &Options) -> Result<impl Future<Output = ()> + use<>, String> {
     let sender = Arc::new(Sender::new(options.clone())?);
-    Ok(tokio::spawn(run(inner.clone(), sender)))
+    Ok(run(inner.clone(), sender))
 }
 
 /// Delivers what is due until the engine is closed. What is under way then is waited for.

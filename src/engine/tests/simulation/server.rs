@@ -125,7 +125,7 @@ impl Server {
                 worker
             })
             .collect();
-        let threads = Threads { workers, threads: Vec::new(), ended };
+        let threads = Threads { workers, ended };
         let starting = tokio::spawn(Engine::start_with(options, Arc::new(store), threads));
         drop(entered);
         Self { runtime, link, starting: Some(starting), engine: None, draining: None, dead }
