@@ -159,7 +159,7 @@ impl Draft {
     }
 }
 
-fn check_track_set_size(set: &proto::TrackSet, limits: &Limits) -> Result<(), InvalidInput> {
+pub(super) fn check_track_set_size(set: &proto::TrackSet, limits: &Limits) -> Result<(), InvalidInput> {
     let lengths = [
         ("views", set.views.len(), limits.max_views),
         ("track_count", set.track_count as usize, limits.max_tracks),

@@ -5,7 +5,7 @@ use prost::Message;
 use prost::bytes::Buf;
 use prost::encoding::{DecodeContext, WireType, decode_key, decode_varint, skip_field};
 
-use super::input::{Draft, within};
+use super::input::{self, Draft, within};
 use super::matches;
 use crate::domain::{InvalidInput, Limits, Violation};
 use crate::rpc::proto;
@@ -101,16 +101,7 @@ fn track_set_field(
         8 if packed => doubles(buf, &mut set.depths, "track_set.depths", max),
         _ => {
             set.merge_field(tag, wire, buf, DecodeContext::default()).map_err(malformed)?;
-            let counts = [
-                ("views", set.views.len(), limits.max_views),
-                ("view_indices", set.view_indices.len(), max),
-                ("track_indices", set.track_indices.len(), max),
-                ("xs", set.xs.len(), max),
-                ("ys", set.ys.len(), max),
-                ("sigmas_px", set.sigmas_px.len(), max),
-                ("depths", set.depths.len(), max),
-            ];
-            within("track_set", &counts)
+            input::check_track_set_size(set, limits)
         }
     }
 }
