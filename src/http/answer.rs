@@ -14,8 +14,8 @@ use serde_json::{Map, Value, json};
 use tonic::{Code, Status, Streaming};
 use tonic_types::StatusExt;
 
+use crate::rpc::access_log::code_name;
 use crate::rpc::inflight::{HeldBody, Permit};
-use crate::rpc::meter::code_name;
 use crate::rpc::status;
 use crate::telemetry::metrics::{HttpRefusal, http_refused};
 

@@ -6,7 +6,7 @@ use std::sync::Arc;
 use tonic::{Code, Request, Status};
 use tracing::Instrument;
 
-use super::meter::{CallRecord, code_name};
+use super::access_log::{CallRecord, code_name};
 use super::convert::names;
 use super::keys::{Grant, Scope};
 use super::rates::Rates;

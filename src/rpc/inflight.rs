@@ -7,13 +7,8 @@ use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::task::{Context, Poll};
 
 use http_body::{Body as HttpBody, Frame, SizeHint};
-use prost::bytes::Bytes;
 use tonic::Status;
-use tonic::body::Body;
-use tonic::codegen::http::{Request, Response};
-use tower::{Layer, Service};
 
-use super::meter::CallRecord;
 use super::status;
 use crate::telemetry::metrics::{Refusal, inflight_bytes, inflight_capacity, refused};
 
@@ -89,7 +84,7 @@ impl Permit {
         Self { shared: Arc::new(Shared { budget, charge: Mutex::default() }) }
     }
 
-    /// The permit of a call that came through [`Inflight`].
+    /// The permit of a call that came through the [`CallLayer`](super::call::CallLayer).
     ///
     /// # Errors
     /// `INTERNAL` for one that did not: a service outside of the layer would be bounded by nothing.
@@ -126,7 +121,7 @@ impl Permit {
     }
 
     /// More of a message came.
-    fn receive(&self, bytes: u64) -> Result<(), Status> {
+    pub fn receive(&self, bytes: u64) -> Result<(), Status> {
         self.change(|charge| {
             charge.message = charge.message.saturating_add(bytes);
             charge.largest_message = charge.largest_message.max(charge.message);
@@ -155,60 +150,6 @@ impl Drop for Shared {
     }
 }
 
-/// The layer that gives every call a [`Permit`] and charges the messages on their way in to it.
-#[derive(Debug, Clone)]
-pub struct Inflight {
-    budget: Arc<Budget>,
-}
-
-impl Inflight {
-    pub fn new(budget: Arc<Budget>) -> Self {
-        Self { budget }
-    }
-}
-
-impl<S> Layer<S> for Inflight {
-    type Service = Charged<S>;
-
-    fn layer(&self, inner: S) -> Charged<S> {
-        Charged { inner, budget: Arc::clone(&self.budget) }
-    }
-}
-
-/// A service whose calls are charged.
-#[derive(Debug, Clone)]
-pub struct Charged<S> {
-    inner: S,
-    budget: Arc<Budget>,
-}
-
-impl<S> Service<Request<Body>> for Charged<S>
-where
-    S: Service<Request<Body>, Response = Response<Body>>,
-    S::Future: Send + 'static,
-{
-    type Response = Response<Body>;
-    type Error = S::Error;
-    type Future = Pin<Box<dyn Future<Output = Result<Self::Response, S::Error>> + Send>>;
-
-    fn poll_ready(&mut self, context: &mut Context<'_>) -> Poll<Result<(), S::Error>> {
-        self.inner.poll_ready(context)
-    }
-
-    fn call(&mut self, mut request: Request<Body>) -> Self::Future {
-        // A port that reads requests in another form has charged them already.
-        let permit = match request.extensions().get::<Permit>() {
-            Some(permit) => permit.clone(),
-            None => Permit::new(Arc::clone(&self.budget)),
-        };
-        request.extensions_mut().insert(permit.clone());
-        let answer_permit = permit.clone();
-        let record = CallRecord::of(request.extensions());
-        let answer = self.inner.call(request.map(|body| Body::new(ChargedBody { body, permit, record })));
-        Box::pin(async move { Ok(answer.await?.map(|body| Body::new(HeldBody { body, permit: answer_permit }))) })
-    }
-}
-
 /// An answer's body, with the permit of what it is made of: a reader that is slow holds it.
 #[derive(Debug)]
 pub struct HeldBody<B> {
@@ -225,43 +166,6 @@ impl<B: HttpBody + Unpin> HttpBody for HeldBody<B> {
         context: &mut Context<'_>,
     ) -> Poll<Option<Result<Frame<B::Data>, B::Error>>> {
         Pin::new(&mut self.body).poll_frame(context)
-    }
-
-    fn is_end_stream(&self) -> bool {
-        self.body.is_end_stream()
-    }
-
-    fn size_hint(&self) -> SizeHint {
-        self.body.size_hint()
-    }
-}
-
-/// The frames of a request, as long as the budget holds them.
-struct ChargedBody {
-    body: Body,
-    permit: Permit,
-    /// Counts what comes.
-    record: Option<Arc<CallRecord>>,
-}
-
-impl HttpBody for ChargedBody {
-    type Data = Bytes;
-    type Error = Status;
-
-    fn poll_frame(mut self: Pin<&mut Self>, context: &mut Context<'_>) -> Poll<Option<Result<Frame<Bytes>, Status>>> {
-        let frame = Pin::new(&mut self.body).poll_frame(context);
-        if let Poll::Ready(Some(Ok(frame))) = &frame
-            && let Some(data) = frame.data_ref()
-        {
-            let bytes = data.len() as u64;
-            if let Some(record) = &self.record {
-                record.receive(bytes);
-            }
-            if let Err(refusal) = self.permit.receive(bytes) {
-                return Poll::Ready(Some(Err(refusal)));
-            }
-        }
-        frame
     }
 
     fn is_end_stream(&self) -> bool {

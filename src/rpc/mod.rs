@@ -3,19 +3,19 @@
 //! Depends on `engine`, `telemetry` and `domain`; this module, `http`, `client` and a few commands see prost and
 //! tonic.
 
+pub mod access_log;
 pub mod admin;
 pub mod auth;
 pub mod calibration;
+pub mod call;
 pub mod caller;
 pub mod convert;
 pub mod disconnect;
-pub mod error_details;
 pub mod inflight;
 pub mod inputs;
 pub mod jobs;
 pub mod keys;
 pub mod listener;
-pub mod meter;
 pub mod proto;
 pub mod rates;
 pub mod reload;

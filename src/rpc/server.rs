@@ -17,19 +17,20 @@ use tonic::service::Routes;
 use tonic::transport::server::Router;
 use tonic_health::ServingStatus;
 use tonic_health::server::HealthReporter;
+use tower::Layer;
 use tower::layer::util::{Identity, Stack};
 
+use super::access_log::RefusalLog;
 use super::admin::Admin;
-use super::auth::{Authenticate, Authenticated};
+use super::auth::Authenticate;
 use super::calibration::{self, Calibration};
+use super::call::{CallLayer, CallService};
 use super::caller::Tenant;
-use super::error_details::{ErrorDetailsLayer, ErrorDetailsService};
-use super::inflight::{Budget, Charged, Inflight, Permit};
+use super::inflight::{Budget, Permit};
 use super::inputs::{self, Inputs};
 use super::jobs::Jobs;
 use super::keys::{self, KeyRing};
 use super::listener::{self, ConnectionInfo};
-use super::meter::{MetricsLayer, MetricsService, RefusalLog};
 use super::proto::FILE_DESCRIPTOR_SET;
 use super::proto::admin_service_server::AdminServiceServer;
 use super::proto::calibration_service_server::CalibrationServiceServer;
@@ -189,10 +190,12 @@ impl Server {
         let certificates = certificates(&options).await?;
         let keys = keys(&options).await?;
         let key_count = keys.as_ref().map(|keys| keys.borrow().len());
-        let metrics_layer = MetricsLayer::default();
         let rates = Arc::new(Rates::new(options.rates, DefaultClock::default()));
-        let authenticate = Authenticate::new(keys, rates);
-        let budget = Budget::new(options.max_inflight_bytes);
+        let calls = CallLayer {
+            authenticate: Authenticate::new(keys, rates),
+            budget: Budget::new(options.max_inflight_bytes),
+            refusals: RefusalLog::default(),
+        };
         let listen_error = |source| Error::Listen { address: options.listen, source };
         let listener = TcpListener::bind(options.listen).await.map_err(listen_error)?;
         let address = listener.local_addr().map_err(listen_error)?;
@@ -210,19 +213,12 @@ impl Server {
             protocol: None,
         };
         let gateway = Gateway {
-            service: tower::ServiceBuilder::new()
-                .layer(metrics_layer.clone())
-                .layer(ErrorDetailsLayer)
-                .layer(authenticate.clone())
-                .layer(Inflight::new(Arc::clone(&budget)))
-                .service(services.clone()),
+            service: calls.layer(services.clone()),
             listener: listener_options.clone(),
             describes: options.reflection,
-            authenticate: authenticate.clone(),
-            budget: Arc::clone(&budget),
-            refusals: metrics_layer.refusals.clone(),
+            calls: calls.clone(),
         };
-        let router = router(&options, services, metrics_layer, authenticate, budget).add_service(health_service);
+        let router = router(&options, services, calls).add_service(health_service);
         let stop = CancellationToken::new();
         let stopped = stop.clone().cancelled_owned();
         let incoming = listener::incoming(listener, listener_options).into_stream();
@@ -362,22 +358,17 @@ async fn keys(options: &Options) -> Result<Option<Current<KeyRing>>, Error> {
     kept.map(Some).map_err(Error::Keys)
 }
 
-/// What goes around every service; the first to be added, [`MetricsLayer`], is outermost.
-type Layers = Stack<Inflight, Stack<Authenticate, Stack<ErrorDetailsLayer, Stack<MetricsLayer, Identity>>>>;
-
-/// The API as another port of the same process serves it: the same services behind the same layers, and what it needs
+/// The API as another port of the same process serves it: the same services behind the same layer, and what it needs
 /// to treat its callers in the same way.
 #[derive(Debug, Clone)]
 pub struct Gateway {
     /// Calls that never leave the process.
-    pub service: MetricsService<ErrorDetailsService<Authenticated<Charged<Routes>>>>,
+    pub service: CallService<Routes>,
     /// How gRPC's own connections are let in.
     pub listener: listener::Options,
     /// Whether callers may ask for the API's description.
     pub describes: bool,
-    authenticate: Authenticate,
-    budget: Arc<Budget>,
-    refusals: RefusalLog,
+    calls: CallLayer,
 }
 
 impl Gateway {
@@ -387,7 +378,7 @@ impl Gateway {
     /// # Errors
     /// `UNAUTHENTICATED`.
     pub fn check_key(&self, headers: &HeaderMap, connection_info: &ConnectionInfo) -> Result<Tenant, Status> {
-        let checked = self.authenticate.check(headers);
+        let checked = self.calls.authenticate.check(headers);
         let tenant = checked.inspect_err(|status| self.log_refused(status, connection_info))?;
         connection_info.set_authenticated();
         Ok(tenant)
@@ -395,17 +386,17 @@ impl Gateway {
 
     /// Writes down that a request was refused before it became a call.
     pub fn log_refused(&self, status: &Status, connection_info: &ConnectionInfo) {
-        self.refusals.log_early(status, connection_info);
+        self.calls.refusals.log_early(status, connection_info);
     }
 
     /// Whether callers need keys.
     pub fn asks_for_keys(&self) -> bool {
-        self.authenticate.is_on()
+        self.calls.authenticate.is_on()
     }
 
     /// A permit for what a request holds beside its call.
     pub fn permit(&self) -> Permit {
-        Permit::new(Arc::clone(&self.budget))
+        Permit::new(Arc::clone(&self.calls.budget))
     }
 }
 
@@ -440,19 +431,10 @@ fn services(options: &Options, engine: Engine) -> Result<Routes, Error> {
     Ok(services.add_service(reflection().build_v1()?).add_service(reflection().build_v1alpha()?))
 }
 
-/// The services behind their layers, as connections reach them.
-fn router(
-    options: &Options,
-    services: Routes,
-    metrics_layer: MetricsLayer,
-    authenticate: Authenticate,
-    budget: Arc<Budget>,
-) -> Router<Layers> {
+/// The services behind the layer of calls, as connections reach them.
+fn router(options: &Options, services: Routes, calls: CallLayer) -> Router<Stack<CallLayer, Identity>> {
     tonic::transport::Server::builder()
-        .layer(metrics_layer)
-        .layer(ErrorDetailsLayer)
-        .layer(authenticate)
-        .layer(Inflight::new(budget))
+        .layer(calls)
         .concurrency_limit_per_connection(MAX_REQUESTS_PER_CONNECTION)
         .max_concurrent_streams(MAX_STREAMS_PER_CONNECTION)
         .http2_keepalive_interval(Some(options.keepalive))

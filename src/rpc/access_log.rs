@@ -1,19 +1,13 @@
-//! Counts every call by method and status code, from the request's headers to the last byte of its answer, and writes
-//! it down: a line a call in the access log, and refusals in the log, at most ten a minute for each code.
+//! What is written down of calls: each is counted by method and status code, has a line in the access log, and where it
+//! is refused one in the log, at most ten a minute for each code.
 
 use std::net::SocketAddr;
-use std::pin::Pin;
 use std::sync::atomic::{AtomicU64, Ordering};
 use std::sync::{Arc, OnceLock};
-use std::task::{Context, Poll};
 
-use http_body::{Body as HttpBody, Frame};
-use prost::bytes::Bytes;
-use tonic::body::Body;
-use tonic::codegen::http::{Extensions, Request, Response};
+use tonic::codegen::http::{Extensions, Request};
 use tonic::{Code, Status};
 use tonic_types::StatusExt;
-use tower::{Layer, Service};
 
 use super::auth::is_open;
 use super::caller::TRACE_PARENT;
@@ -76,7 +70,7 @@ pub struct CallRecord {
 }
 
 impl CallRecord {
-    /// The record of a call that came through the [`MetricsLayer`].
+    /// The record of a call that came through the [`CallLayer`](super::call::CallLayer).
     pub fn of(extensions: &Extensions) -> Option<Arc<Self>> {
         extensions.get().cloned()
     }
@@ -150,78 +144,30 @@ impl RefusalLog {
     }
 }
 
-/// The layer; goes around everything else.
-#[derive(Debug, Clone, Default)]
-pub struct MetricsLayer {
-    pub refusals: RefusalLog,
-}
-
-impl<S> Layer<S> for MetricsLayer {
-    type Service = MetricsService<S>;
-
-    fn layer(&self, inner: S) -> MetricsService<S> {
-        MetricsService { inner, refusals: self.refusals.clone() }
-    }
-}
-
-/// A service whose calls are counted.
-#[derive(Debug, Clone)]
-pub struct MetricsService<S> {
-    inner: S,
-    refusals: RefusalLog,
-}
-
-impl<S, B> Service<Request<B>> for MetricsService<S>
-where
-    S: Service<Request<B>, Response = Response<Body>>,
-    S::Future: Send + 'static,
-{
-    type Response = Response<MetricsBody>;
-    type Error = S::Error;
-    type Future = Pin<Box<dyn Future<Output = Result<Self::Response, S::Error>> + Send>>;
-
-    fn poll_ready(&mut self, context: &mut Context<'_>) -> Poll<Result<(), S::Error>> {
-        self.inner.poll_ready(context)
-    }
-
-    fn call(&mut self, mut request: Request<B>) -> Self::Future {
-        let path = request.uri().path();
-        let call = OpenCall {
-            counted: RpcCall::begin(method_of(path)),
-            is_open: is_open(path),
-            record: Arc::new(CallRecord::begin(&request)),
-            refusals: self.refusals.clone(),
-            sent_bytes: 0,
-        };
-        request.extensions_mut().insert(call.record.clone());
-        let answer = self.inner.call(request);
-        Box::pin(async move {
-            let answer = answer.await?;
-            // An error without a message has its status in the headers.
-            let call = match Status::from_header_map(answer.headers()) {
-                Some(status) => {
-                    call.end(&status);
-                    None
-                }
-                None => Some(call),
-            };
-            Ok(answer.map(|body| MetricsBody { body, call }))
-        })
-    }
-}
-
 /// A call that has not ended. Dropped without a status it is one whose client went away.
-struct OpenCall {
+pub struct OpenCall {
     counted: RpcCall,
     /// Health checks: they would be most of the access log.
     is_open: bool,
-    record: Arc<CallRecord>,
+    pub record: Arc<CallRecord>,
     refusals: RefusalLog,
-    sent_bytes: u64,
+    /// Of the answer, so far.
+    pub sent_bytes: u64,
 }
 
 impl OpenCall {
-    fn end(mut self, status: &Status) {
+    pub fn begin<B>(request: &Request<B>, refusals: RefusalLog) -> Self {
+        let path = request.uri().path();
+        Self {
+            counted: RpcCall::begin(method_of(path)),
+            is_open: is_open(path),
+            record: Arc::new(CallRecord::begin(request)),
+            refusals,
+            sent_bytes: 0,
+        }
+    }
+
+    pub fn end(mut self, status: &Status) {
         self.counted.code = code_name(status.code());
         self.refusals.log(status, self.counted.method, &self.record);
     }
@@ -246,47 +192,6 @@ impl Drop for OpenCall {
             trace = record.trace.as_deref(),
             "call"
         );
-    }
-}
-
-/// A body whose trailers, or whose drop, end the call.
-pub struct MetricsBody {
-    body: Body,
-    call: Option<OpenCall>,
-}
-
-impl HttpBody for MetricsBody {
-    type Data = Bytes;
-    type Error = Status;
-
-    fn poll_frame(mut self: Pin<&mut Self>, context: &mut Context<'_>) -> Poll<Option<Result<Frame<Bytes>, Status>>> {
-        let frame = Pin::new(&mut self.body).poll_frame(context);
-        let no_status = || Status::unknown("the answer has no status");
-        let status = match &frame {
-            Poll::Ready(Some(Ok(frame))) => {
-                if let (Some(data), Some(call)) = (frame.data_ref(), &mut self.call) {
-                    call.sent_bytes += data.len() as u64;
-                }
-                frame.trailers_ref().map(|trailers| Status::from_header_map(trailers).unwrap_or_else(no_status))
-            }
-            Poll::Ready(Some(Err(status))) => Some(status.clone()),
-            Poll::Ready(None) => Some(no_status()),
-            Poll::Pending => None,
-        };
-        if let Some(status) = status
-            && let Some(call) = self.call.take()
-        {
-            call.end(&status);
-        }
-        frame
-    }
-
-    fn is_end_stream(&self) -> bool {
-        self.body.is_end_stream()
-    }
-
-    fn size_hint(&self) -> http_body::SizeHint {
-        self.body.size_hint()
     }
 }
 
@@ -315,77 +220,11 @@ pub fn code_name(code: Code) -> &'static str {
 
 #[cfg(test)]
 mod tests {
-    use std::collections::VecDeque;
-    use std::convert::Infallible;
-
-    use metrics_exporter_prometheus::PrometheusBuilder;
     use prost::Message;
     use prost_types::method_options::IdempotencyLevel;
-    use tonic::codegen::http::{HeaderMap, HeaderValue};
 
     use super::*;
     use crate::rpc::proto::FILE_DESCRIPTOR_SET;
-
-    /// A body of given frames.
-    struct Frames(VecDeque<Frame<Bytes>>);
-
-    impl HttpBody for Frames {
-        type Data = Bytes;
-        type Error = Status;
-
-        fn poll_frame(
-            mut self: Pin<&mut Self>,
-            _context: &mut Context<'_>,
-        ) -> Poll<Option<Result<Frame<Bytes>, Status>>> {
-            Poll::Ready(self.0.pop_front().map(Ok))
-        }
-    }
-
-    fn with_status(code: &'static str) -> HeaderMap {
-        HeaderMap::from_iter([("grpc-status".parse().expect("a header"), HeaderValue::from_static(code))])
-    }
-
-    /// The code under which a call is counted whose answer has these headers and frames, `read` of which are read.
-    fn counted_as(headers: HeaderMap, frames: Vec<Frame<Bytes>>, read: usize) -> String {
-        let recorder = PrometheusBuilder::new().build_recorder();
-        metrics::with_local_recorder(&recorder, || {
-            let mut answer = Response::new(Body::new(Frames(frames.into())));
-            *answer.headers_mut() = headers;
-            let mut answer = Some(answer);
-            let inner = tower::service_fn(move |_: Request<()>| {
-                let answer = answer.take().expect("called once");
-                async { Ok::<_, Infallible>(answer) }
-            });
-            let request = Request::builder().uri("/scpsfm.v1.JobService/GetJob").body(()).expect("a request");
-            let runtime = tokio::runtime::Builder::new_current_thread().build().expect("a runtime");
-            runtime.block_on(async {
-                let Ok(answer) = MetricsLayer::default().layer(inner).call(request).await;
-                let mut body = answer.into_body();
-                for _ in 0..read {
-                    std::future::poll_fn(|context| Pin::new(&mut body).poll_frame(context)).await;
-                }
-            });
-        });
-        let page = recorder.handle().render();
-        let counts: Vec<&str> = page.lines().filter(|line| line.starts_with("scpsfm_grpc_requests_total{")).collect();
-        let [count] = counts[..] else { panic!("not one count:\n{page}") };
-        assert!(count.contains("JobService/GetJob") && count.ends_with(" 1"), "{count}");
-        let (_, rest) = count.split_once("code=\"").expect("a code");
-        rest.split('"').next().expect("a value").to_owned()
-    }
-
-    #[test]
-    fn a_call_is_counted_once_by_how_it_ended() {
-        let data = || Frame::data(Bytes::from_static(b"message"));
-        assert_eq!(counted_as(with_status("5"), vec![], 0), "NOT_FOUND");
-        assert_eq!(counted_as(HeaderMap::new(), vec![data(), Frame::trailers(with_status("0"))], 2), "OK");
-        assert_eq!(
-            counted_as(HeaderMap::new(), vec![data(), Frame::trailers(with_status("8"))], 3),
-            "RESOURCE_EXHAUSTED"
-        );
-        assert_eq!(counted_as(HeaderMap::new(), vec![data()], 2), "UNKNOWN");
-        assert_eq!(counted_as(HeaderMap::new(), vec![data(), data()], 1), "CANCELLED");
-    }
 
     #[test]
     fn every_method_of_the_api_is_known() {
