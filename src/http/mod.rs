@@ -43,7 +43,7 @@ use tokio_util::sync::CancellationToken;
 
 use crate::domain::job::Job;
 use crate::rpc::convert;
-use crate::rpc::listener::{self, Incoming};
+use crate::rpc::listener::{self, Listener};
 use crate::rpc::proto::FILE_DESCRIPTOR_SET;
 use crate::rpc::server::Gateway;
 use crate::telemetry::silence;
@@ -128,11 +128,11 @@ impl Server {
         let listener = TcpListener::bind(options.listen).await.map_err(listen_error)?;
         let address = listener.local_addr().map_err(listen_error)?;
         let pool = DescriptorPool::decode(FILE_DESCRIPTOR_SET).map_err(|error| Error::Api(error.to_string()))?;
-        let incoming = listener::Options { protocol: Some(HTTP_1), ..gateway.listener.clone() };
-        let incoming = listener::incoming(listener, incoming);
+        let listening = listener::Options { protocol: Some(HTTP_1), ..gateway.listener.clone() };
+        let listener = Listener::new(listener, listening);
         let api = Api::new(&pool, gateway, options).map_err(Error::Api)?;
         let stop = CancellationToken::new();
-        let task = tokio::spawn(serve(incoming, Arc::new(api), stop.clone()));
+        let task = tokio::spawn(serve(listener, Arc::new(api), stop.clone()));
         Ok(Self { address, stop, task })
     }
 
@@ -158,12 +158,12 @@ impl Drop for Server {
 
 /// Serves connections until it is told to stop, and then until their requests have been answered. Dropped, it cuts them
 /// off.
-async fn serve(mut incoming: Incoming, api: Arc<Api>, stop: CancellationToken) {
+async fn serve(mut listener: Listener, api: Arc<Api>, stop: CancellationToken) {
     let graceful = GracefulShutdown::new();
     let mut connections = JoinSet::new();
     loop {
         let connection = tokio::select! {
-            connection = incoming.next() => connection,
+            connection = listener.next() => connection,
             Some(_) = connections.join_next() => continue,
             () = stop.cancelled() => break,
         };

@@ -1,7 +1,6 @@
 //! Where connections come in: each has a bound of time to shake hands and to say that it speaks HTTP/2, and those that
 //! have not yet are few enough to hold up nobody. Those that speak have a bound of time to call as someone who may.
 
-mod refusals;
 mod unauthenticated;
 
 use std::collections::VecDeque;
@@ -19,16 +18,15 @@ use tokio::io::{AsyncRead, AsyncReadExt, AsyncWrite, AsyncWriteExt, ReadBuf};
 use tokio::net::{TcpListener, TcpStream};
 use tokio::sync::{OwnedSemaphorePermit, Semaphore};
 use tokio::task::{AbortHandle, JoinSet};
-use tokio::time::Instant;
 use tokio_rustls::TlsAcceptor;
 use tokio_rustls::rustls::ServerConfig;
 use tonic::transport::server::Connected;
 
-use self::refusals::Refusals;
 use self::unauthenticated::AuthDeadline;
 pub use self::unauthenticated::{AUTH_TIMEOUT, ConnectionInfo};
 use super::reload::Current;
 use crate::telemetry::metrics;
+use crate::telemetry::throttle::Throttle;
 
 /// How long a connection may take to its first words: three round trips of the slowest link, and no reason for a caller
 /// to be slower.
@@ -95,52 +93,43 @@ pub struct Options {
     pub protocol: Option<&'static [u8]>,
 }
 
-/// The connections of a listener, in the order in which they have shaken hands.
-pub struct Incoming(ConnectionListener);
-
-/// Takes connections. Each handshake begins with the certificate that is in force then; those that fail or stall leave
-/// nothing but a line in the log.
-pub fn incoming(listener: TcpListener, options: Options) -> Incoming {
-    Incoming(ConnectionListener {
-        listener,
-        permits: Arc::new(Semaphore::new(options.max_established.min(Semaphore::MAX_PERMITS))),
-        refusal_permits: Arc::new(Semaphore::new(MAX_REFUSALS)),
-        options,
-        refusal_log: Refusals::default(),
-        handshaking: JoinSet::new(),
-        oldest_first: VecDeque::new(),
-    })
-}
-
-impl Incoming {
-    /// The next one; waits for ever where none comes.
-    pub async fn next(&mut self) -> Connection {
-        self.0.next().await
-    }
-
-    /// The same as a stream, which never ends.
-    pub fn into_stream(self) -> impl Stream<Item = Result<Connection, Infallible>> {
-        stream::unfold(self, async |mut incoming| {
-            let connection = incoming.next().await;
-            Some((Ok(connection), incoming))
-        })
-    }
-}
-
-struct ConnectionListener {
+/// Takes connections, in the order in which they have shaken hands. Each handshake begins with the certificate that is
+/// in force then; those that fail or stall leave nothing but a line in the log.
+pub struct Listener {
     listener: TcpListener,
     options: Options,
     /// One for each connection that may speak.
     permits: Arc<Semaphore>,
     /// One for each connection that is being refused.
     refusal_permits: Arc<Semaphore>,
-    refusal_log: Refusals,
+    refusal_log: Throttle,
     handshaking: JoinSet<Result<Established, String>>,
     oldest_first: VecDeque<AbortHandle>,
 }
 
-impl ConnectionListener {
-    async fn next(&mut self) -> Connection {
+impl Listener {
+    pub fn new(listener: TcpListener, options: Options) -> Self {
+        Self {
+            listener,
+            permits: Arc::new(Semaphore::new(options.max_established.min(Semaphore::MAX_PERMITS))),
+            refusal_permits: Arc::new(Semaphore::new(MAX_REFUSALS)),
+            options,
+            refusal_log: Throttle::of(1),
+            handshaking: JoinSet::new(),
+            oldest_first: VecDeque::new(),
+        }
+    }
+
+    /// The connections as a stream, which never ends.
+    pub fn into_stream(self) -> impl Stream<Item = Result<Connection, Infallible>> {
+        stream::unfold(self, async |mut listener| {
+            let connection = listener.next().await;
+            Some((Ok(connection), listener))
+        })
+    }
+
+    /// The next connection; waits for ever where none comes.
+    pub async fn next(&mut self) -> Connection {
         loop {
             tokio::select! {
                 accepted = self.listener.accept() => match accepted {
@@ -163,7 +152,6 @@ impl ConnectionListener {
                     Err(error) if error.is_cancelled() => tracing::debug!("a silent connection made room for another"),
                     Err(error) => tracing::error!(%error, "a connection's task failed"),
                 },
-                count = self.refusal_log.next_count() => self.log_refused(count),
             }
         }
     }
@@ -192,16 +180,15 @@ impl ConnectionListener {
         self.oldest_first.push_back(handshake);
     }
 
-    fn log_refused(&self, count: u64) {
-        let max_connections = self.options.max_established;
-        tracing::warn!(count, max_connections, "connections were refused: as many speak as may");
-    }
-
     /// Answers a connection that there is no room for it.
     fn refuse(&mut self, established: Established) {
         metrics::connection_refused();
-        if let Some(count) = self.refusal_log.add(Instant::now()) {
-            self.log_refused(count);
+        let max_connections = self.options.max_established;
+        let log = move |count: u64| {
+            tracing::warn!(count, max_connections, "connections were refused: as many speak as may");
+        };
+        if self.refusal_log.allows(log) {
+            log(1);
         }
         let Ok(place) = self.refusal_permits.clone().try_acquire_owned() else { return };
         let is_http_1 = self.options.protocol.is_some();
@@ -371,7 +358,7 @@ mod tests {
             auth_timeout: None,
             protocol: None,
         };
-        let connections = tokio::spawn(async move { incoming(listener, options).next().await });
+        let connections = tokio::spawn(async move { Listener::new(listener, options).next().await });
         // A reset overtakes the answer in some of so many, and a client that is told too early loses its call.
         for attempt in 0..100 {
             let mut client = CalibrationServiceClient::connect(url.clone()).await.expect("a connection");

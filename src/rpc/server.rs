@@ -30,7 +30,7 @@ use super::inflight::{Budget, Permit};
 use super::inputs::{self, Inputs};
 use super::jobs::Jobs;
 use super::keys::{self, KeyRing};
-use super::listener::{self, ConnectionInfo};
+use super::listener::{self, ConnectionInfo, Listener};
 use super::proto::FILE_DESCRIPTOR_SET;
 use super::proto::admin_service_server::AdminServiceServer;
 use super::proto::calibration_service_server::CalibrationServiceServer;
@@ -221,7 +221,7 @@ impl Server {
         let router = router(&options, services, calls).add_service(health_service);
         let stop = CancellationToken::new();
         let stopped = stop.clone().cancelled_owned();
-        let incoming = listener::incoming(listener, listener_options).into_stream();
+        let incoming = Listener::new(listener, listener_options).into_stream();
         let task = tokio::spawn(router.serve_with_incoming_shutdown(incoming, stopped));
         let store_task = tokio::spawn(follow_store(Arc::clone(&health), store));
         Ok(Self { address, key_count, gateway, health, store_task, stop, task })

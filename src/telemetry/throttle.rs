@@ -12,8 +12,18 @@ const LINES: u32 = 10;
 const MINUTE: Duration = Duration::from_secs(60);
 
 /// Counts the lines of one kind. Clones count together.
-#[derive(Debug, Clone, Default)]
-pub struct Throttle(Arc<Mutex<Window>>);
+#[derive(Debug, Clone)]
+pub struct Throttle {
+    /// Of a minute.
+    lines: u32,
+    window: Arc<Mutex<Window>>,
+}
+
+impl Default for Throttle {
+    fn default() -> Self {
+        Self::of(LINES)
+    }
+}
 
 /// The minute that began with its first line.
 #[derive(Debug, Default)]
@@ -24,15 +34,20 @@ struct Window {
 }
 
 impl Throttle {
+    /// So many lines a minute.
+    pub fn of(lines: u32) -> Self {
+        Self { lines, window: Arc::default() }
+    }
+
     /// Whether a line may be written now. Of those that may not, `report` gets the number at the end of the minute.
     pub fn allows(&self, report: impl FnOnce(u64) + Send + 'static) -> bool {
         let now = Instant::now();
-        let mut window = self.0.lock().unwrap_or_else(PoisonError::into_inner);
+        let mut window = self.window.lock().unwrap_or_else(PoisonError::into_inner);
         if window.end.is_none_or(|end| end <= now) {
             // What the minute before left out is about to be reported by its task.
             *window = Window { end: Some(now + MINUTE), lines: 0, left_out: window.left_out };
         }
-        if window.lines < LINES {
+        if window.lines < self.lines {
             window.lines += 1;
             return true;
         }
@@ -43,7 +58,7 @@ impl Throttle {
             let throttle = self.clone();
             runtime.spawn(async move {
                 sleep_until(end).await;
-                let mut window = throttle.0.lock().unwrap_or_else(PoisonError::into_inner);
+                let mut window = throttle.window.lock().unwrap_or_else(PoisonError::into_inner);
                 let left_out = std::mem::take(&mut window.left_out);
                 drop(window);
                 report(left_out);
