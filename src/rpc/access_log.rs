@@ -5,7 +5,7 @@ use std::net::SocketAddr;
 use std::sync::atomic::{AtomicU64, Ordering};
 use std::sync::{Arc, OnceLock};
 
-use tonic::codegen::http::{Extensions, Request};
+use tonic::codegen::http::Request;
 use tonic::{Code, Status};
 use tonic_types::StatusExt;
 
@@ -60,7 +60,7 @@ pub fn scope_of(path: &str) -> Scope {
     find(path).map_or(Scope::ReadOnly, |(_, scope)| scope)
 }
 
-/// What is known of a call while it is under way, for whoever writes of it; in its request's extensions.
+/// What is known of a call while it is under way, for whoever writes of it.
 #[derive(Debug, Default)]
 pub struct CallRecord {
     peer: Option<SocketAddr>,
@@ -70,11 +70,6 @@ pub struct CallRecord {
 }
 
 impl CallRecord {
-    /// The record of a call that came through the [`CallLayer`](super::call::CallLayer).
-    pub fn of(extensions: &Extensions) -> Option<Arc<Self>> {
-        extensions.get().cloned()
-    }
-
     fn begin<B>(request: &Request<B>) -> Self {
         let trace_parent = request.headers().get(TRACE_PARENT).and_then(|value| value.to_str().ok());
         Self {

@@ -10,7 +10,7 @@ use tonic::codegen::http::header::{AUTHORIZATION, CONTENT_TYPE};
 use tonic::codegen::http::{HeaderMap, Method, Request};
 
 use super::access_log::{self, CallRecord};
-use super::caller::Tenant;
+use super::caller::{Caller, Tenant};
 use super::keys::{Grant, Hash, KeyRing};
 use super::listener::ConnectionInfo;
 use super::rates::Rates;
@@ -58,7 +58,7 @@ impl Authenticate {
     ///
     /// # Errors
     /// `UNAUTHENTICATED`, `PERMISSION_DENIED`, and `RESOURCE_EXHAUSTED` for a rate.
-    pub fn admit(&self, request: &mut Request<Body>, record: &CallRecord) -> Result<CallKey, Status> {
+    pub fn admit(&self, request: &mut Request<Body>, record: &Arc<CallRecord>) -> Result<CallKey, Status> {
         if is_open(request.uri().path()) {
             // Where keys are asked for, one who checks the server's health is still unauthenticated.
             if self.keys.is_none() {
@@ -76,8 +76,8 @@ impl Authenticate {
             return Err(status::scope_missing(needed));
         }
         self.rates.call(hash)?;
-        request.extensions_mut().insert(tenant);
-        request.extensions_mut().insert(self.rates.clone());
+        let caller = Caller::new(tenant, request.headers(), self.rates.clone(), record.clone());
+        request.extensions_mut().insert(caller);
         // No service needs it any more, and none can let it slip.
         request.headers_mut().remove(AUTHORIZATION);
         Ok(key)

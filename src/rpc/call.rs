@@ -59,7 +59,6 @@ where
         let CallLayer { authenticate, budget, refusals } = &self.layer;
         let call = OpenCall::begin(&request, refusals.clone());
         let record = call.record.clone();
-        request.extensions_mut().insert(record.clone());
         // A port that reads requests in another form has charged them already.
         let charged = request.extensions().get::<Permit>().cloned();
         let permit = charged.unwrap_or_else(|| Permit::new(Arc::clone(budget)));

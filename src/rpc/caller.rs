@@ -3,6 +3,7 @@
 use std::fmt::Display;
 use std::sync::Arc;
 
+use tonic::codegen::http::HeaderMap;
 use tonic::{Code, Request, Status};
 use tracing::Instrument;
 
@@ -18,7 +19,7 @@ use crate::telemetry::tracing::AUDIT;
 /// Header of the W3C trace context.
 pub const TRACE_PARENT: &str = "traceparent";
 
-/// The tenant of a call, as [`Authenticate`](super::auth::Authenticate) puts it into a request's extensions.
+/// The tenant of a call.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Tenant {
     id: String,
@@ -53,25 +54,24 @@ impl Default for Tenant {
 pub struct Caller {
     tenant: Tenant,
     trace_parent: Option<String>,
-    rates: Option<Arc<Rates>>,
-    record: Option<Arc<CallRecord>>,
+    rates: Arc<Rates>,
+    record: Arc<CallRecord>,
 }
 
 impl Caller {
+    /// Of a call with these headers, for [`Authenticate`](super::auth::Authenticate), which puts it into the request's
+    /// extensions.
+    pub fn new(tenant: Tenant, headers: &HeaderMap, rates: Arc<Rates>, record: Arc<CallRecord>) -> Self {
+        let trace_parent = headers.get(TRACE_PARENT).and_then(|value| value.to_str().ok()).map(str::to_owned);
+        Self { tenant, trace_parent, rates, record }
+    }
+
     /// # Errors
-    /// `INTERNAL` for a request that did not come through the layer that finds the tenant: a service that was put
+    /// `INTERNAL` for a request that did not come through the layer that finds the caller: a service that was put
     /// outside of it must not answer as if everyone were the default tenant.
     pub fn of<T>(request: &Request<T>) -> Result<Self, Status> {
-        let Some(tenant) = request.extensions().get().cloned() else {
-            return Err(status::internal(&"a request reached a service without a tenant"));
-        };
-        let trace_parent = request.metadata().get(TRACE_PARENT).and_then(|value| value.to_str().ok());
-        Ok(Self {
-            tenant,
-            trace_parent: trace_parent.map(str::to_owned),
-            rates: request.extensions().get().cloned(),
-            record: CallRecord::of(request.extensions()),
-        })
+        let caller = request.extensions().get().cloned();
+        caller.ok_or_else(|| status::internal(&"a request reached a service without a caller"))
     }
 
     /// Counts jobs that the caller is about to create for its tenant's rate.
@@ -79,7 +79,7 @@ impl Caller {
     /// # Errors
     /// `RESOURCE_EXHAUSTED`, reason `RATE_LIMITED`.
     pub fn count_jobs(&self, count: usize) -> Result<(), Status> {
-        self.rates.as_ref().map_or(Ok(()), |rates| rates.jobs(self.tenant.id(), count))
+        self.rates.jobs(self.tenant.id(), count)
     }
 
     /// Writes into the audit log that the caller did this to the resource, or tried to.
@@ -115,12 +115,11 @@ impl Caller {
     }
 
     fn write_audit(&self, method: &'static str, resource: &dyn Display, code: Code) {
-        let record = self.record.as_deref();
         tracing::info!(
             target: AUDIT,
             tenant = self.tenant.id(),
-            key = record.and_then(CallRecord::key),
-            peer = record.and_then(CallRecord::peer),
+            key = self.record.key(),
+            peer = self.record.peer(),
             method,
             resource = %resource,
             code = code_name(code),
@@ -170,25 +169,29 @@ impl Caller {
 
 #[cfg(test)]
 mod tests {
+    use governor::clock::DefaultClock;
+
     use super::*;
+    use crate::rpc::rates;
 
     #[test]
     fn other_tenants_are_out_of_reach() {
-        let mut request = Request::new(());
-        assert_eq!(Caller::of(&request).expect_err("no tenant").code(), Code::Internal);
-        request.extensions_mut().insert(Tenant::default());
-        let caller = Caller::of(&request).expect("a tenant");
+        assert_eq!(Caller::of(&Request::new(())).expect_err("no caller").code(), Code::Internal);
+        let caller = |tenant| {
+            let rates = Rates::new(rates::Options::default(), DefaultClock::default());
+            Caller::new(tenant, &HeaderMap::new(), Arc::new(rates), Arc::default())
+        };
+        let of = |scope| {
+            let tenant = Tenant::of(&Grant { tenant: "north".into(), scope });
+            caller(tenant).job("tenants/other/jobs/a").is_ok()
+        };
+        assert_eq!(Scope::ALL.map(of), [false, false, true], "an administrator names every tenant's");
+        let caller = caller(Tenant::default());
         assert_eq!(caller.parent("tenants/default").expect("own"), "default");
         assert_eq!(caller.parent("tenants/other").expect_err("another's").code(), Code::NotFound);
         assert_eq!(caller.parent("default").expect_err("malformed").code(), Code::InvalidArgument);
         assert!(caller.job("tenants/default/jobs/a").is_ok());
         assert_eq!(caller.job("tenants/other/jobs/a").expect_err("another's").code(), Code::NotFound);
         assert_eq!(caller.job("jobs/a").expect_err("malformed").code(), Code::InvalidArgument);
-        let of = |scope| {
-            let mut request = Request::new(());
-            request.extensions_mut().insert(Tenant::of(&Grant { tenant: "north".into(), scope }));
-            Caller::of(&request).expect("a tenant").job("tenants/other/jobs/a").is_ok()
-        };
-        assert_eq!(Scope::ALL.map(of), [false, false, true], "an administrator names every tenant's");
     }
 }
