@@ -16,9 +16,9 @@ use tracing::{Instrument, Span};
 use super::limits::{RunPermit, SolverMemory};
 use super::observe::{self, Attempt, AttemptLost};
 use super::running::Running;
-use super::worker::{Assignment, AttemptHandle, Report, Started, Verdict, Worker};
+use super::worker::{Assignment, AttemptHandle, End, Started, Worker, broken, stopped};
 use super::{Inner, Phase};
-use crate::domain::job::{Failure, Job, JobName, JobState};
+use crate::domain::job::{Job, JobName, JobState};
 use crate::domain::{Grade, Progress, StopReason, StopToken};
 use crate::solver;
 use crate::store::{self, Claimed, Claims, Ending, Lease, Outcome, Store};
@@ -42,9 +42,6 @@ pub(super) const RETRY_PAUSE: Duration = Duration::from_millis(500);
 
 /// How often an attempt that waits for memory looks whether it is to stop: as often as a solver does.
 const STOP_LOOK: Duration = Duration::from_millis(50);
-
-/// `Failure::reason` of a defect of ours.
-const INTERNAL: &str = "INTERNAL";
 
 /// Waits for the store no longer than the lease holds: a database that hangs must not keep the work going.
 pub(super) async fn in_time<T>(
@@ -99,7 +96,7 @@ pub(super) struct Loaded {
 /// An attempt that is over, and that the store does not know of yet.
 pub(super) struct Finished {
     execution: JobExecution,
-    verdict: Verdict,
+    end: End,
     latest: Option<Progress>,
 }
 
@@ -162,11 +159,11 @@ impl JobExecution {
         let loading = async {
             let input = match self.take_memory().await {
                 Ok(()) => self.read_input().await,
-                Err(verdict) => Err(verdict),
+                Err(end) => Err(end),
             };
             let input = match input {
                 Ok(input) => input,
-                Err(verdict) => return Err(Finished::new(self, verdict, None)),
+                Err(end) => return Err(Finished::new(self, end, None)),
             };
             let subscription = self.inner.notifier.subscribe(&self.job.name);
             // Weights of an earlier attempt are out of date.
@@ -189,7 +186,7 @@ impl JobExecution {
 
     /// Takes the memory that the solver is estimated to need. Waits for jobs that have it to end; a prefetched job,
     /// which has no heartbeats, is given up instead.
-    async fn take_memory(&mut self) -> Result<(), Verdict> {
+    async fn take_memory(&mut self) -> Result<(), End> {
         let Job { view_count, track_count, observation_count, .. } = self.job;
         let bytes = solver::estimated_bytes(view_count, track_count, observation_count);
         let inner = self.inner.clone();
@@ -198,7 +195,7 @@ impl JobExecution {
             return Ok(());
         }
         if !self.is_begun() {
-            return Err(Verdict::Stopped(StopReason::Interrupted));
+            return Err(stopped(StopReason::Interrupted));
         }
         tracing::info!(bytes, "waits for memory that other jobs have");
         let mut taking = pin!(inner.limits.acquire_memory(bytes));
@@ -219,7 +216,7 @@ impl JobExecution {
                     // A drain lets those finish that are being solved.
                     let drain = (inner.phase() != Phase::Open).then_some(StopReason::Interrupted);
                     if let Some(reason) = self.stop.reason().or(drain) {
-                        return Err(Verdict::Stopped(reason));
+                        return Err(stopped(reason));
                     }
                 }
             }
@@ -229,7 +226,7 @@ impl JobExecution {
     /// Reads the input, and the cancel that may have come before the job was listed as running. A store that is out
     /// of reach is asked again as long as the lease holds, which heartbeats keep while a large input is read. There are
     /// none for a prefetched job.
-    async fn read_input(&mut self) -> Result<Vec<u8>, Verdict> {
+    async fn read_input(&mut self) -> Result<Vec<u8>, End> {
         loop {
             let mut reading = pin!(read(self.inner.store.clone(), self.job.name.clone(), self.stop.clone()));
             let mut heartbeats = self.heartbeats();
@@ -246,10 +243,10 @@ impl JobExecution {
                 Ok(input) if !self.lost => return Ok(input),
                 Ok(_) => {}
                 Err(error @ store::Error::Unavailable(_)) => self.store_failed(&error),
-                Err(error) => return Err(Verdict::Broken(error.to_string())),
+                Err(error) => return Err(broken(error.to_string())),
             }
             if self.lost {
-                return Err(Verdict::Stopped(StopReason::Interrupted));
+                return Err(stopped(StopReason::Interrupted));
             }
             sleep(RETRY_PAUSE).await;
         }
@@ -292,14 +289,9 @@ impl JobExecution {
             }
         };
         let latest = *reported.borrow();
-        let verdict = match report {
-            Some(Report { verdict, attempt }) => {
-                self.attempt = Some(attempt);
-                verdict
-            }
-            None => Verdict::Stopped(StopReason::Interrupted),
-        };
-        Finished::new(self, verdict, latest)
+        let (end, attempt) = report.unzip();
+        self.attempt = attempt;
+        Finished::new(self, end.flatten(), latest)
     }
 
     async fn store_progress(&mut self, progress: Option<Progress>) {
@@ -460,26 +452,19 @@ impl Loaded {
 }
 
 impl Finished {
-    fn new(mut execution: JobExecution, verdict: Verdict, latest: Option<Progress>) -> Self {
+    fn new(mut execution: JobExecution, end: End, latest: Option<Progress>) -> Self {
         execution.running.set_solved();
         drop(execution.memory.take());
-        Self { execution, verdict, latest }
+        Self { execution, end, latest }
     }
 
     /// Commits what the attempt came to.
     pub(super) async fn finalise(self) {
-        let Self { mut execution, verdict, latest } = self;
+        let Self { mut execution, end, latest } = self;
         let span = execution.span.clone();
         let finalising = async {
-            let outcome = match verdict {
-                Verdict::Solved { summary, result } => Some(Outcome::Succeeded { summary, result }),
-                Verdict::Broken(message) => Some(Outcome::Failed(Failure::new(INTERNAL, message))),
-                Verdict::Stopped(StopReason::Cancelled) => Some(Outcome::Cancelled),
-                Verdict::Stopped(StopReason::DeadlineExceeded) => Some(Outcome::DeadlineExceeded),
-                Verdict::Stopped(StopReason::Interrupted) => None,
-            };
             let progress = latest.filter(|_| execution.stored != latest);
-            let ending = outcome.map(|outcome| Arc::new(Ending { outcome, progress }));
+            let ending = end.map(|outcome| Arc::new(Ending { outcome, progress }));
             let committed = execution.commit(ending.as_ref()).await;
             execution.announce(committed);
         };

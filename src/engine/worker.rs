@@ -14,13 +14,16 @@ use tracing::Span;
 use super::notifier::Subscription;
 use super::observe::Attempt;
 use super::{ResultEncoder, Solver};
-use crate::domain::job::{EventBody, JobEvent, JobName, Summary};
+use crate::domain::job::{EventBody, Failure, JobEvent, JobName, Summary};
 use crate::domain::{Input, Observer, Progress, Solution, SolveSettings, Stage, StopReason, StopToken};
 use crate::solver;
-use crate::store::{EncodedResult, payload};
+use crate::store::{EncodedResult, Outcome, payload};
 
 /// Stack of a worker: the numerics recurse little, but keep small matrices on it; the main thread's usual size.
 const STACK_BYTES: usize = 8 << 20;
+
+/// `Failure::reason` of a defect of ours.
+const INTERNAL: &str = "INTERNAL";
 
 /// One attempt's worth of work.
 pub(super) struct Assignment {
@@ -50,7 +53,7 @@ pub(super) struct AttemptHandle {
     pub started: oneshot::Receiver<Started>,
     pub progress: watch::Receiver<Option<Progress>>,
     /// Dropped unanswered where the thread is gone, or a prefetched job was not begun.
-    pub report: oneshot::Receiver<Report>,
+    pub report: oneshot::Receiver<(End, Attempt)>,
 }
 
 /// An assignment on its way to the thread, with where it answers.
@@ -58,25 +61,24 @@ pub(super) struct Assigned {
     assignment: Assignment,
     started: oneshot::Sender<Started>,
     progress: watch::Sender<Option<Progress>>,
-    reply: oneshot::Sender<Report>,
+    reply: oneshot::Sender<(End, Attempt)>,
 }
 
-/// What an attempt came to.
-pub(super) struct Report {
-    pub verdict: Verdict,
-    pub attempt: Attempt,
+/// What an attempt came to; `None`: it was interrupted, and its job goes back to the queue.
+pub(super) type End = Option<Outcome>;
+
+/// Of an attempt that was told to stop.
+pub(super) fn stopped(reason: StopReason) -> End {
+    match reason {
+        StopReason::Cancelled => Some(Outcome::Cancelled),
+        StopReason::DeadlineExceeded => Some(Outcome::DeadlineExceeded),
+        StopReason::Interrupted => None,
+    }
 }
 
-/// How the solver ended.
-#[derive(Debug)]
-pub(super) enum Verdict {
-    Solved {
-        summary: Summary,
-        result: EncodedResult,
-    },
-    Stopped(StopReason),
-    /// A defect: the solver's error, a panic, an input that cannot be read.
-    Broken(String),
+/// Of a defect: the solver's error, a panic, an input that cannot be read.
+pub(super) fn broken(message: impl Into<String>) -> End {
+    Some(Outcome::Failed(Failure::new(INTERNAL, message)))
 }
 
 /// Feeds one worker thread; the thread ends when the last of its feeders is dropped.
@@ -135,7 +137,7 @@ struct Opened {
     settings: SolveSettings,
     stop: StopToken,
     reporter: Reporter,
-    reply: oneshot::Sender<Report>,
+    reply: oneshot::Sender<(End, Attempt)>,
 }
 
 impl Assigned {
@@ -146,7 +148,7 @@ impl Assigned {
         if let Some(reason) = stop.reason() {
             if let Some(attempt) = attempt {
                 // As below, nobody may be listening.
-                let _ = reply.send(Report { verdict: Verdict::Stopped(reason), attempt });
+                let _ = reply.send((stopped(reason), attempt));
             }
             return None;
         }
@@ -162,11 +164,11 @@ fn work(assigned: Assigned, solver: &Solver, encode: ResultEncoder) {
     reporter.attempt.at_work();
     let span = reporter.attempt.span().clone();
     let _entered = span.enter();
-    let verdict = catch_unwind(AssertUnwindSafe(|| solve(input, &settings, &mut reporter, &stop, solver, encode)))
-        .unwrap_or_else(|panic| Verdict::Broken(format!("the solver panicked: {}", panic_message(panic.as_ref()))));
+    let end = catch_unwind(AssertUnwindSafe(|| solve(input, &settings, &mut reporter, &stop, solver, encode)))
+        .unwrap_or_else(|panic| broken(format!("the solver panicked: {}", panic_message(panic.as_ref()))));
     reporter.attempt.at_rest();
     // Nobody listens any more when the engine went down with its runtime; the store then tells the next start.
-    let _ = reply.send(Report { verdict, attempt: reporter.attempt });
+    let _ = reply.send((end, reporter.attempt));
 }
 
 fn solve(
@@ -176,19 +178,19 @@ fn solve(
     stop: &StopToken,
     solver: &Solver,
     encode: ResultEncoder,
-) -> Verdict {
+) -> End {
     let decoded: Input = match payload::decode(&input, "the job's input") {
         Ok(decoded) => decoded,
-        Err(error) => return Verdict::Broken(error.to_string()),
+        Err(error) => return broken(error.to_string()),
     };
     drop(input);
     match solver(&decoded, settings, reporter, stop) {
         Ok(solution) => {
             let result = EncodedResult::new(encode(&reporter.name, &solution));
-            Verdict::Solved { summary: summarise(&solution, result.bytes.len() as u64), result }
+            Some(Outcome::Succeeded { summary: summarise(&solution, result.bytes.len() as u64), result })
         }
-        Err(solver::Error::Stopped(reason)) => Verdict::Stopped(reason),
-        Err(solver::Error::Internal(message)) => Verdict::Broken(message),
+        Err(solver::Error::Stopped(reason)) => stopped(reason),
+        Err(solver::Error::Internal(message)) => broken(message),
     }
 }
 
@@ -254,7 +256,7 @@ impl Observer for Reporter {
 pub(super) struct Simulated {
     reporter: Reporter,
     stop: StopToken,
-    reply: oneshot::Sender<Report>,
+    reply: oneshot::Sender<(End, Attempt)>,
 }
 
 #[cfg(test)]
@@ -288,17 +290,17 @@ impl Simulated {
     pub(super) fn succeed(self, solution: &Solution, result: Vec<u8>) {
         let result = EncodedResult::new(result);
         let summary = summarise(solution, result.bytes.len() as u64);
-        self.end(Verdict::Solved { summary, result });
+        self.end(Some(Outcome::Succeeded { summary, result }));
     }
 
     /// Ends with a defect, unless it was stopped.
     pub(super) fn fail(self) {
-        self.end(Verdict::Broken("told to fail".into()));
+        self.end(broken("told to fail"));
     }
 
-    fn end(self, verdict: Verdict) {
-        let verdict = self.stop.reason().map_or(verdict, Verdict::Stopped);
+    fn end(self, end: End) {
+        let end = self.stop.reason().map_or(end, stopped);
         // Nobody listens any more where the engine went down.
-        let _ = self.reply.send(Report { verdict, attempt: self.reporter.attempt });
+        let _ = self.reply.send((end, self.reporter.attempt));
     }
 }
