@@ -4,6 +4,7 @@
 //! nothing is returned without a grade. Planes and rotations have starts of their own; what leaves the focal length
 //! free is refused with the reason.
 
+mod averaging;
 mod critical;
 mod fit;
 mod grading;

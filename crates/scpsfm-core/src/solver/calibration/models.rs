@@ -1,14 +1,12 @@
-//! Which intrinsics the data carry, and what not knowing that costs the focal length.
+//! Which intrinsics the data carry.
 
 use super::fit::Fit;
 use super::options::{CalibrationOptions, GradeOptions};
 use super::search::{Minimum, Search};
 use super::{Error, Uncalibrated};
 use crate::domain::{FocalPrior, StopToken, Warning, WarningCode};
-use crate::geometry::bundle::Options;
 use crate::geometry::bundle::metric::{
-    self, Extension, Information, Intrinsics, IntrinsicsModel, IntrinsicsPrior, MetricReconstruction, Optimum,
-    Parameter,
+    Extension, Information, Intrinsics, IntrinsicsModel, IntrinsicsPrior, MetricReconstruction, Optimum, Parameter,
 };
 
 /// A metric reconstruction under one model, with what the observations say of the intrinsics there.
@@ -19,7 +17,7 @@ pub(super) struct Candidate {
     pub minimum: Minimum,
     /// Of the observations alone, without what the prior costs.
     pub fit: Fit,
-    information: Option<Information>,
+    pub information: Option<Information>,
 }
 
 impl Candidate {
@@ -49,12 +47,12 @@ impl Candidate {
     }
 
     /// Standard deviation of the log focal length if the model is right, the largest of the groups that have one.
-    fn sigma_log_focal(&self) -> Option<f64> {
+    pub fn sigma_log_focal(&self) -> Option<f64> {
         (0..self.priors.len()).filter_map(|group| self.sigma_of_focal(group)).reduce(f64::max)
     }
 
     /// Value of a parameter of a group, of the log focal length in the mean where views have their own.
-    fn value(&self, group: usize, parameter: Parameter) -> f64 {
+    pub fn value(&self, group: usize, parameter: Parameter) -> f64 {
         let reconstruction = &self.minimum.reconstruction;
         match parameter {
             Parameter::LogFocal if reconstruction.has_own_focals() => self.minimum.log_focal(),
@@ -64,7 +62,7 @@ impl Candidate {
 
     /// Variance, for observations with unit variance, and value of the log focal length of each view that has its own
     /// at the minimum of a model.
-    fn own_focals(&self, optimum: &Optimum) -> Vec<(Option<f64>, f64)> {
+    pub fn own_focals(&self, optimum: &Optimum) -> Vec<(Option<f64>, f64)> {
         let Some(information) = &self.information else { return Vec::new() };
         let focals = self.minimum.reconstruction.focals.iter();
         let of_views = information.own_focals(optimum).into_iter().zip(focals);
@@ -82,23 +80,6 @@ pub(super) struct Selection {
     pub best: Candidate,
     /// Simpler models, and richer ones that were not taken, of the same minimum.
     pub tried: Vec<Candidate>,
-}
-
-/// A model as the observations and what lenses are like weigh it.
-struct Weighed<'a> {
-    log_weight: f64,
-    /// What it was linearised at.
-    from: &'a Candidate,
-    optimum: Optimum,
-}
-
-/// Standard deviations, the doubt about the model included.
-pub(super) struct Sigmas {
-    /// Of each group's intrinsics that the model frees, indexed by [`Parameter`], the log focal length's also where
-    /// every view has its own, then of their mean; `None`: unobservable or not free.
-    pub of_group: Vec<[Option<f64>; Parameter::COUNT]>,
-    /// Of the log focal length of each view that has its own; `None`: unobservable.
-    pub view_focals: Vec<Option<f64>>,
 }
 
 /// What the choice of a model works with.
@@ -225,7 +206,7 @@ impl Choice<'_> {
         lenses.map(|(lens, (imaged, ray))| Some(imaged).filter(|_| is_barrel(lens) && ray > least)).collect()
     }
 
-    /// Extensions that the linearisation foretells to be significant, with the gain beyond what is, largest first.
+    /// Extensions that the linearisation predicts to be significant, with the gain beyond what is, largest first.
     fn promising(&self, best: &Candidate) -> Vec<(Extension, f64)> {
         let Some(here) = best.optimum(best.model, &best.priors) else { return Vec::new() };
         let beyond = |extension: Extension| {
@@ -287,190 +268,5 @@ impl Choice<'_> {
             focal_px(richer),
         );
         Warning::new(WarningCode::ModelMismatch, detail)
-    }
-
-    /// Standard deviations under the best model and all doubt about it.
-    ///
-    /// Bayesian model averaging (Hoeting, Madigan, Raftery & Volinsky 1999, eq. 3) over all combinations of extensions:
-    /// the expected squared error of the value reported, `sum_k w_k (sigma_k^2 + (f_k - f)^2)`, with the weights from
-    /// Laplace's approximation of each model's evidence under [`LensOptions`](super::options::LensOptions), a model
-    /// with distortion once for each kind of lens. An extension that the data can neither confirm nor refute thus costs
-    /// what it would move.
-    ///
-    /// * `inflation`: factor on all of them, for what the calibration does not fit
-    pub fn sigmas(&self, selection: &Selection, inflation: f64) -> Sigmas {
-        let best = &selection.best;
-        let views = best.minimum.reconstruction.focals.len();
-        let own = best.sigma_log_focal().and_then(|own| Some((own, best.optimum(best.model, &best.priors)?)));
-        let Some((own, here)) = own else {
-            let of_group = vec![[None; Parameter::COUNT]; self.problem.groups()];
-            return Sigmas { of_group, view_focals: vec![None; views] };
-        };
-        let profiled = self.profiled(own, best);
-        let unit = best.fit.noise.powi(2);
-        let models: Vec<Weighed> =
-            best.model.with_any_extensions().flat_map(|model| self.weighed(selection, model)).collect();
-        let highest = models.iter().map(|model| model.log_weight).fold(f64::NEG_INFINITY, f64::max);
-        let weights: Vec<f64> = models.iter().map(|model| (model.log_weight - highest).exp()).collect();
-        let total: f64 = weights.iter().sum();
-        // Of what has this variance and value under each model, and this value under the best.
-        let averaged = |of_models: &mut dyn Iterator<Item = (Option<f64>, f64)>, here: f64| {
-            let mut squared = 0.0;
-            for (weight, (variance, value)) in weights.iter().map(|weight| weight / total).zip(of_models) {
-                match variance {
-                    Some(variance) => squared += weight * (variance * unit + (value - here).powi(2)),
-                    None if weight > self.problem.options.models.negligible => return None,
-                    None => {}
-                }
-            }
-            // What the profile adds to the chosen model's own deviation, it adds to the whole.
-            Some(squared.sqrt() * profiled / own * inflation).filter(|sigma| sigma.is_finite())
-        };
-        let free = best.model.parameters();
-        let of_parameter = |group: usize, parameter: Parameter| {
-            let is_free = free.contains(&parameter) || (views > 0 && parameter == Parameter::LogFocal);
-            let value =
-                |from: &Candidate, optimum: &Optimum| from.value(group, parameter) + optimum.shift_of(group, parameter);
-            let mut of_models = models
-                .iter()
-                .map(|Weighed { from, optimum, .. }| (optimum.variance_of(group, parameter), value(from, optimum)));
-            averaged(&mut of_models, value(best, &here)).filter(|_| is_free)
-        };
-        let groups = 0..self.problem.groups();
-        let of_group = groups.map(|group| Parameter::ALL.map(|parameter| of_parameter(group, parameter))).collect();
-        let here = best.own_focals(&here);
-        let there: Vec<_> = models.iter().map(|model| model.from.own_focals(&model.optimum)).collect();
-        let of_view = |view: usize| averaged(&mut there.iter().map(|of_views| of_views[view]), here[view].1);
-        Sigmas { of_group, view_focals: (0..views).map(of_view).collect() }
-    }
-
-    /// A model for each kind of lens that it may be of, from the candidate that was adjusted with most nearly the same
-    /// extensions: where the observations are weak, a linearisation foretells half of what an adjustment finds.
-    fn weighed<'c>(&self, selection: &'c Selection, model: IntrinsicsModel) -> Vec<Weighed<'c>> {
-        let Selection { best, tried } = selection;
-        let differing = |candidate: &Candidate| {
-            let extensions = Extension::ALL.into_iter();
-            extensions.filter(|one| candidate.model.contains(*one) != model.contains(*one)).count()
-        };
-        let adjusted = std::iter::once(best).chain(tried.iter().rev().filter(|tried| tried.information.is_some()));
-        let Some(from) = adjusted.min_by_key(|candidate| differing(candidate)) else { return Vec::new() };
-        let of_kind = |(share, precision): (f64, f64)| {
-            let narrowed = |prior: &IntrinsicsPrior| prior.narrowed(Parameter::RadialK1, precision);
-            let priors: Vec<IntrinsicsPrior> = best.priors.iter().map(narrowed).collect();
-            let optimum = from.optimum(model, &priors)?;
-            let gain = (best.fit.cost - from.fit.cost - optimum.delta_cost) / best.fit.noise.powi(2);
-            let log_weight = share.ln() + self.log_prior(model, &priors) + 0.5 * gain - 0.5 * optimum.log_determinant;
-            Some(Weighed { log_weight, from, optimum })
-        };
-        self.problem.options.lenses.kinds(model).into_iter().filter_map(of_kind).collect()
-    }
-
-    /// Logarithm of the prior probability of a model and of the density of its parameters where they are most likely,
-    /// up to what all models share.
-    fn log_prior(&self, model: IntrinsicsModel, priors: &[IntrinsicsPrior]) -> f64 {
-        let lenses = &self.problem.options.lenses;
-        let of = |extension: Extension| match model.contains(extension) {
-            true => {
-                let of_group = |prior: &IntrinsicsPrior| -> f64 {
-                    extension.parameters().iter().map(|parameter| prior.information[*parameter as usize].ln()).sum()
-                };
-                lenses.probability(extension).ln() + 0.5 * priors.iter().map(of_group).sum::<f64>()
-            }
-            false if model.admits(extension) => (1.0 - lenses.probability(extension)).ln(),
-            false => 0.0,
-        };
-        Extension::ALL.into_iter().map(of).sum()
-    }
-
-    /// The standard deviation as the profile of the cost shows it, where that is larger than the linearised one.
-    ///
-    /// The focal length, of several groups all in their ratios, is held three standard deviations away while everything
-    /// else adjusts; the chi-square should rise by nine. Near critical motions the linearisation is optimistic: it is
-    /// taken where the noise has moved the scene.
-    fn profiled(&self, sigma: f64, best: &Candidate) -> f64 {
-        let options = &self.problem.options.models;
-        let shift = (options.profile_deviations * sigma).min(options.profile_longest);
-        if shift <= 0.0 {
-            return sigma;
-        }
-        let model = best.model.without_focal();
-        let side = |shift: f64| {
-            let mut moved = best.minimum.reconstruction.clone();
-            moved.scale_focals(shift.exp());
-            let options = Options::squared(options.profile_iterations);
-            let report =
-                metric::adjust(&mut moved, self.problem.observations, model, &best.priors, &options, self.stop);
-            let of_group = |(prior, intrinsics): (&IntrinsicsPrior, &Intrinsics)| {
-                let deviation = prior.deviation(Parameter::LogFocal, intrinsics);
-                prior.information[Parameter::LogFocal as usize] * deviation.powi(2)
-            };
-            let of_priors: f64 = best.priors.iter().zip(&moved.intrinsics).map(of_group).sum();
-            (report.cost + of_priors - best.minimum.cost).max(0.0) / best.fit.noise.powi(2)
-        };
-        let rise = side(shift).min(side(-shift));
-        sigma.max(shift / rise.sqrt().max(f64::MIN_POSITIVE))
-    }
-}
-
-#[cfg(test)]
-mod tests {
-    use nalgebra::Vector4;
-
-    use super::*;
-    use crate::geometry::bundle::testing::{self, TestScene};
-    use crate::solver::calibration::tests::of_one_lens;
-
-    const NOISE: f64 = 0.001;
-
-    /// A scene in which every track lives five views: what is far apart is held together by many weak links.
-    fn banded(seed: u64, views: usize) -> TestScene {
-        let mut scene = testing::scene(seed, views, 10 * views, NOISE);
-        let first = |point: usize| point % (views - 4);
-        scene.observations.retain(|seen| (first(seen.point)..first(seen.point) + 5).contains(&seen.view));
-        scene
-    }
-
-    /// The focal length held, everything else follows to the bottom of the valley, however long that takes.
-    #[test]
-    fn the_profile_is_taken_where_all_else_has_followed() {
-        let turning = [0.1, 0.02].into_iter().flat_map(|turning| {
-            (0..3).map(move |seed| {
-                (format!("turning {turning}, seed {seed}"), testing::scene_turning(seed, 40, NOISE, turning))
-            })
-        });
-        let banded = [10, 20, 40]
-            .into_iter()
-            .flat_map(|views| (0..3).map(move |seed| (format!("{views} views, seed {seed}"), banded(seed, views))));
-        let options = CalibrationOptions::DEFAULT.models;
-        let mut longest = 0;
-        for (case, scene) in turning.chain(banded) {
-            let points: Vec<Vector4<f64>> = scene.points.iter().map(|point| point.push(1.0)).collect();
-            let cameras = scene.cameras();
-            let problem = of_one_lens(&cameras, &points, &scene.observations, NOISE);
-            let (priors, stop) = (vec![problem.options.lenses.prior(NOISE, None, 1000.0)], StopToken::default());
-            let choice = Choice { problem: &problem, scale_px: 1000.0, stop: &stop };
-            let reconstruction = scene.reconstruction();
-            for model in [IntrinsicsModel::FOCAL, IntrinsicsModel::FULL] {
-                let minimum = choice.search(&priors).converged(reconstruction.clone(), model);
-                let best = Candidate::new(minimum, model, priors.clone(), &problem);
-                let sigma = best.sigma_log_focal().expect("observable");
-                let profiled = choice.profiled(sigma, &best);
-                let shift = (options.profile_deviations * sigma).min(options.profile_longest);
-                let mut rise = |shift: f64| {
-                    let mut moved = best.minimum.reconstruction.clone();
-                    moved.scale_focals(shift.exp());
-                    let options = Options { max_iterations: 5000, relative_tolerance: 1e-13, ..Options::default() };
-                    let model = model.without_focal();
-                    let report = metric::adjust(&mut moved, &scene.observations, model, &priors, &options, &stop);
-                    longest = longest.max(report.iterations);
-                    (report.cost - best.minimum.cost) / best.fit.noise.powi(2)
-                };
-                let expected = sigma.max(shift / rise(shift).min(rise(-shift)).sqrt());
-                println!("{case}, {}: sigma {sigma:.5}, profiled {profiled:.5} for {expected:.5}", model.name());
-                assert!((profiled / expected - 1.0).abs() < 0.01, "{case}: {profiled} for {expected}");
-            }
-        }
-        println!("{longest} iterations at most");
-        assert!(longest < options.profile_iterations, "{longest} iterations");
     }
 }

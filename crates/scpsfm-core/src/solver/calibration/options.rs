@@ -185,11 +185,11 @@ options! {
         log_aspect_sigma: f64 = 0.1,
         /// Of `k1`, where it is estimated: that of wide lenses, which have up to -.3.
         radial_k1_sigma: f64 = 0.2,
-        /// The same of nearly straight lenses. Phones and cameras have a few hundredths.
-        straight_k1_sigma: f64 = 0.04,
-        /// Share of the nearly straight among the lenses that distort: as many as wide ones. With wide ones alone a
+        /// The same of lenses of low distortion. Phones and cameras have a few hundredths.
+        low_distortion_k1_sigma: f64 = 0.04,
+        /// Share of these among the lenses that distort: as many as wide ones. With wide ones alone a
         /// `k1` of .04 that gained 10 in chi-square had a weight of .03.
-        straight_share: f64 = 0.5,
+        low_distortion_share: f64 = 0.5,
         /// Of `k2` and `k3`. Calibrations on boards give k2 and k3 the size of k1, with either sign.
         later_radial_sigma: f64 = 0.2,
         /// Of `p1` and `p2`. Calibrations on boards give some thousandths, and what a decentred lens mostly does is
@@ -235,13 +235,13 @@ impl LensOptions {
         }
     }
 
-    /// The lenses that a model may be of: the probability of each among these, and the factor on the precision to which
-    /// its `k1` is known beforehand.
+    /// The kinds of lens that a model may be of: the probability of each among these, and the factor by which the prior
+    /// standard deviation of its `k1` is smaller.
     pub fn kinds(&self, model: IntrinsicsModel) -> Vec<(f64, f64)> {
         match model.contains(Extension::RadialK1) {
             true => vec![
-                (1.0 - self.straight_share, 1.0),
-                (self.straight_share, self.radial_k1_sigma / self.straight_k1_sigma),
+                (1.0 - self.low_distortion_share, 1.0),
+                (self.low_distortion_share, self.radial_k1_sigma / self.low_distortion_k1_sigma),
             ],
             false => vec![(1.0, 1.0)],
         }
@@ -270,7 +270,7 @@ options! {
         significant_gain_of_one: f64 = CHI_SQUARE_OF_ONE,
         significant_gain_of_two: f64 = CHI_SQUARE_OF_TWO,
         significance: f64 = GATE_QUANTILE,
-        /// Share of the significant gain that a linearisation must foretell for an adjustment to be tried: it is off
+        /// Share of the significant gain that a linearisation must predict for an adjustment to be tried: it is off
         /// where the richer model is far.
         worth_a_trial: f64 = 0.5,
         /// Share of the noise that a prior was weighed by, below which what is left makes it worth weighing anew. A

@@ -1,8 +1,9 @@
 //! What is told of focal lengths where every view has its own, and whether views have where they were taken to share
 //! one.
 
+use super::averaging::Sigmas;
 use super::fit::Fit;
-use super::models::{Candidate, Choice, Sigmas};
+use super::models::{Candidate, Choice};
 use super::options::{GradeOptions, LensOptions};
 use super::verdict::Verdict;
 use super::{Uncalibrated, ViewFocal};

@@ -59,7 +59,7 @@ impl PointBlock {
         [m00, m11, m22].map(|diagonal| damping * diagonal + least)
     }
 
-    /// The part of a step of this point in what a step is predicted to gain, see
+    /// The share of this point in the decrease of the linearised cost, see
     /// [`Reduced::predicted`](super::reduced::Reduced::predicted).
     pub fn predicted(&self, step: &Vector3<f64>, damping: f64) -> f64 {
         let added = self.damping(damping);

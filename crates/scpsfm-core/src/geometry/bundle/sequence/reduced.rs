@@ -157,16 +157,16 @@ impl Reduced {
     /// Marquardt's damping, and what holds the gauge.
     pub fn damp(&mut self, normal: &Normal, damping: f64) {
         for &index in &normal.cameras.diagonal {
-            self.values[index] += added(normal.cameras.values[index], damping);
+            self.values[index] += damping_of(normal.cameras.values[index], damping);
         }
     }
 
-    /// By how much the linearised residuals shrink under the step of poses and intrinsics that was solved for, beside
-    /// what the points gain: `x' (D x - g)` of a step `x` with `(H + D) x = -g`.
+    /// Decrease of the linearised cost by the step of poses and intrinsics, without the share of the points:
+    /// `x' (D x - g)` for a step `x` with `(H + D) x = -g`.
     pub fn predicted(&self, normal: &Normal, damping: f64) -> f64 {
         let Cameras { values, diagonal, gradient, .. } = &normal.cameras;
         let unknowns = self.vector.iter().zip(gradient).zip(diagonal);
-        unknowns.map(|((x, gradient), &index)| x * (added(values[index], damping) * x - gradient)).sum()
+        unknowns.map(|((x, gradient), &index)| x * (damping_of(values[index], damping) * x - gradient)).sum()
     }
 
     /// Solves for the step in place of the right-hand side; `false` when the system is not positive definite.
@@ -175,8 +175,8 @@ impl Reduced {
     }
 }
 
-/// What is added to the diagonal of poses and intrinsics where it is this: Marquardt's damping, and what holds the gauge.
-fn added(diagonal: f64, damping: f64) -> f64 {
+/// What is added to a diagonal entry of this value: Marquardt's damping, and what holds the gauge.
+fn damping_of(diagonal: f64, damping: f64) -> f64 {
     // Nothing is known of such an unknown: it stays where it is.
     let undetermined = if diagonal > 0.0 { 0.0 } else { 1.0 };
     (damping + GAUGE_DAMPING) * diagonal + undetermined
@@ -283,7 +283,7 @@ impl Columns<'_> {
 }
 
 /// Moves the points of `moved` to where they belong after the step of poses and intrinsics: from where they are in
-/// `from` by `-V^-1 (Jp' r + Jp' Jc dc)`. Returns what they gain of the linearised residuals, see
+/// `from` by `-V^-1 (Jp' r + Jp' Jc dc)`. Returns their share of the decrease of the linearised cost, see
 /// [`Reduced::predicted`]; `None` when that is no number, or it was stopped.
 pub(super) fn substitute(
     moved: &mut MetricReconstruction,

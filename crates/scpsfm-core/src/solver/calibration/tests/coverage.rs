@@ -17,7 +17,7 @@ struct Lens {
 const CENTRAL: Lens = Lens { displaced: 0.0, radial: 0.0 };
 const DISPLACED: Lens = Lens { displaced: 0.05, radial: 0.0 };
 const DISTORTING: Lens = Lens { displaced: 0.05, radial: 0.1 };
-const NEARLY_STRAIGHT: Lens = Lens { displaced: 0.0, radial: 0.04 };
+const LOW_DISTORTION: Lens = Lens { displaced: 0.0, radial: 0.04 };
 
 impl Lens {
     /// A scene through such a lens; with distortion, only what falls into the image.
@@ -126,8 +126,8 @@ fn sigma_is_the_error_through_distorting_lenses() {
 /// Distortion that noise hides is not taken, and costs what it would move.
 #[test]
 #[ignore = "1000 calibrations, a minute or two: run it after a change of what sigma is made of"]
-fn sigma_is_the_error_through_nearly_straight_lenses() {
-    let all = all(500, &[NEARLY_STRAIGHT]);
+fn sigma_is_the_error_through_lenses_of_low_distortion() {
+    let all = all(500, &[LOW_DISTORTION]);
     assert!(all.within(3.0) >= 0.97, "{:.3} within 3 sigma", all.within(3.0));
     assert!((0.60..=0.80).contains(&all.within(1.0)), "{:.3} within 1 sigma", all.within(1.0));
 }
