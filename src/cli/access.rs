@@ -7,7 +7,7 @@ use clap::parser::ValueSource;
 use clap::{Arg, ArgMatches, Args, Command, FromArgMatches};
 
 use super::exit::Failure;
-use super::job_view::quoted;
+use super::shell::quoted;
 use crate::client::{ApiKey, Options, Setting};
 
 /// The variable that may hold the API key. No flag does: other users of the machine see flags.
@@ -151,8 +151,8 @@ impl TenantArg {
 
 impl Args for TenantArg {
     fn augment_args(command: Command) -> Command {
-        let help = "Tenant whose jobs these are; a full name of another tenant is refused beside it [default: that of \
-                    the API key; without a key `default`]";
+        let help = "Tenant of the jobs; a full name of another tenant is then refused [default: that of the API key; \
+                    without a key `default`]";
         let arg = Arg::new(Self::ID).long(Self::ID).help_heading(ACCESS).value_name("ID").env("SCPSFM_TENANT");
         command.arg(arg.help(help))
     }

@@ -6,7 +6,7 @@ use clap::Args;
 
 use super::access::AccessArgs;
 use super::exit::Failure;
-use super::job_view::quoted;
+use super::shell::quoted;
 use crate::client::{Client, MAX_WAIT};
 use crate::parallel::Threads;
 

@@ -57,8 +57,8 @@ pub async fn run(args: Args) -> Result<Exit, Failure> {
     Ok(Exit::Done)
 }
 
-/// Gives names of the key's tenant that tenant's id, so that a job that is named by its id and in full is one, and what
-/// is printed names it wherever it is read.
+/// Replaces `-` by the id of the key's tenant. A job that is named both by its id and in full is then deleted once, and
+/// the printed names are complete.
 async fn name_own_tenant(tenants: impl Iterator<Item = &mut String>, client: &mut Client) -> Result<(), Failure> {
     let own: Vec<&mut String> = tenants.filter(|tenant| *tenant == OWN_TENANT).collect();
     if own.is_empty() {

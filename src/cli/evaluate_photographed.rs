@@ -26,7 +26,7 @@ pub struct PhotographedArgs {
     #[arg(long, groups = ["suite", "beside"],
         conflicts_with_all = ["quick", "sweeps", "beyond", "ablation", "depths", "methods", "paper_width"])]
     pub photographed: bool,
-    /// First of the --seeds seeds. Others than the default show whether a result holds on scenes that nobody looked at
+    /// First of the --seeds seeds. Use another one to check a result on scenes that the program was not tuned on
     #[arg(long, value_name = "SEED", default_value_t = photographed::FIRST_SEED, requires = "photographed")]
     pub first_seed: u64,
 }

@@ -6,7 +6,7 @@ use clap::{Args, ValueEnum};
 
 use super::args::{parse_positive, parse_whole};
 use super::exit::Failure;
-use super::job_view::quoted;
+use super::shell::quoted;
 use crate::domain::{FocalPrior, ImageSize, Limits};
 use crate::formats::{self, Format, LabelledInput, Matches, Reading};
 

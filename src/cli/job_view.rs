@@ -329,12 +329,6 @@ fn taken_up_again(job: &Lost) -> String {
     format!("  scpsfm watch {name}{server}{after}\n  scpsfm result {name}{server}{files}")
 }
 
-/// A word as a shell reads it whole.
-pub fn quoted(word: &str) -> String {
-    let plain = |c: char| c.is_alphanumeric() || "-_./:@%+=,".contains(c);
-    if !word.is_empty() && word.chars().all(plain) { word.into() } else { format!("'{}'", word.replace('\'', "'\\''")) }
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -381,7 +375,6 @@ mod tests {
         assert!(words.contains(&format!("\n  scpsfm watch {there} --after 7\n")), "{words}");
         assert!(words.ends_with(&format!("\n  scpsfm result {there} --out 'a b'")), "{words}");
         assert_eq!(lost(ErrorKind::Refused.error("no"), &job).message, "no");
-        assert_eq!((quoted("a/b.csv"), quoted("it's").as_str()), ("a/b.csv".to_owned(), "'it'\\''s'"));
     }
 
     #[test]

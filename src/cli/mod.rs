@@ -46,6 +46,7 @@ pub mod scene_args;
 pub mod serve;
 pub mod service;
 pub mod settings_args;
+mod shell;
 pub mod solve;
 pub mod submit;
 pub mod summary;

@@ -2,7 +2,7 @@
 
 use std::path::Path;
 
-use super::job_view::quoted;
+use super::shell::quoted;
 use crate::domain::job::Summary;
 use crate::domain::{Grade, Solution, Status, Warning, WarningCode};
 use crate::formats::{Export, Format, result_files};

@@ -6,6 +6,7 @@ use std::time::{Duration, Instant};
 
 use indicatif::{ProgressBar, ProgressStyle};
 
+use crate::domain::words::counted;
 use crate::domain::{Observer, Progress, ReconstructionProgress, Stage, Step, Task};
 
 /// Steps of the bar: finer than any terminal is wide.
@@ -220,7 +221,7 @@ fn is_line_due(last: &Progress, now: &Progress) -> bool {
 /// What a progress record says, in a line.
 fn describe(progress: &Progress) -> String {
     let mut text = whereabouts(progress);
-    text.push_str(&format!("{} inliers so far", progress.inliers));
+    text.push_str(&format!("{} so far", counted(progress.inliers, "inlier")));
     if let Some(focal_px) = progress.focal_px {
         text.push_str(&format!(", focal {focal_px:.1} px"));
     }

@@ -112,8 +112,8 @@ impl Client {
         Ok(Page { jobs, next_page_token: page.next_page_token })
     }
 
-    /// The tenant of the calls. Where the key alone says which, it is that in the names of its jobs and inputs; `None`
-    /// where it has neither.
+    /// The tenant of the calls. Where only the key knows it, it is read from the name of a job or an input; `None` where
+    /// the tenant has neither.
     ///
     /// # Errors
     /// See [`Error`].

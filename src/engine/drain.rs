@@ -113,8 +113,8 @@ impl Inner {
             }
         }
         self.phase.send_replace(Phase::Closed);
-        // Those that outlast this wait for a store or a receiver that hangs, and have nothing that another server or the
-        // next start would miss.
+        // Those that do not end in time wait for a store or a receiver that hangs. Dropping the set aborts them: neither
+        // another server nor the next start needs them.
         let others_ended = timeout(GIVE_BACK_GRACE, all_ended(&mut others));
         let _ = tokio::join!(others_ended, threads_end(threads_ended));
         locked(&self.pool).drained

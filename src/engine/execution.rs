@@ -16,7 +16,7 @@ use tracing::{Instrument, Span};
 use super::limits::{RunPermit, SolverMemory};
 use super::observe::{self, Attempt, AttemptLost};
 use super::running::Running;
-use super::worker::{Assignment, AttemptHandle, End, Started, Worker, broken, stopped};
+use super::worker::{Assignment, AttemptHandle, AttemptOutcome, Started, Worker, failed, stopped};
 use super::{Inner, Phase};
 use crate::domain::job::{Job, JobName, JobState};
 use crate::domain::{Grade, Progress, StopReason, StopToken};
@@ -96,7 +96,7 @@ pub(super) struct Loaded {
 /// An attempt that is over, and that the store does not know of yet.
 pub(super) struct Finished {
     execution: JobExecution,
-    end: End,
+    end: AttemptOutcome,
     latest: Option<Progress>,
 }
 
@@ -186,7 +186,7 @@ impl JobExecution {
 
     /// Takes the memory that the solver is estimated to need. Waits for jobs that have it to end; a prefetched job,
     /// which has no heartbeats, is given up instead.
-    async fn take_memory(&mut self) -> Result<(), End> {
+    async fn take_memory(&mut self) -> Result<(), AttemptOutcome> {
         let Job { view_count, track_count, observation_count, .. } = self.job;
         let bytes = solver::estimated_bytes(view_count, track_count, observation_count);
         let inner = self.inner.clone();
@@ -226,7 +226,7 @@ impl JobExecution {
     /// Reads the input, and the cancel that may have come before the job was listed as running. A store that is out
     /// of reach is asked again as long as the lease holds, which heartbeats keep while a large input is read. There are
     /// none for a prefetched job.
-    async fn read_input(&mut self) -> Result<Vec<u8>, End> {
+    async fn read_input(&mut self) -> Result<Vec<u8>, AttemptOutcome> {
         loop {
             let mut reading = pin!(read(self.inner.store.clone(), self.job.name.clone(), self.stop.clone()));
             let mut heartbeats = self.heartbeats();
@@ -243,7 +243,7 @@ impl JobExecution {
                 Ok(input) if !self.lost => return Ok(input),
                 Ok(_) => {}
                 Err(error @ store::Error::Unavailable(_)) => self.store_failed(&error),
-                Err(error) => return Err(broken(error.to_string())),
+                Err(error) => return Err(failed(error.to_string())),
             }
             if self.lost {
                 return Err(stopped(StopReason::Interrupted));
@@ -452,7 +452,7 @@ impl Loaded {
 }
 
 impl Finished {
-    fn new(mut execution: JobExecution, end: End, latest: Option<Progress>) -> Self {
+    fn new(mut execution: JobExecution, end: AttemptOutcome, latest: Option<Progress>) -> Self {
         execution.running.set_solved();
         drop(execution.memory.take());
         Self { execution, end, latest }

@@ -274,8 +274,8 @@ impl Engine {
     /// The encoded result of a succeeded job.
     ///
     /// # Errors
-    /// [`StoreError::NotFound`], [`Error::NotReady`] for a job in any other state, [`Error::Internal`] for one that is not
-    /// what was stored.
+    /// [`StoreError::NotFound`], [`Error::NotReady`] for a job in any other state, [`StoreError::Corrupt`] for a result
+    /// that is not what was stored.
     pub async fn result(&self, name: &JobName) -> Result<EncodedResult, Error> {
         let state = self.inner.store.job(name).await?.state;
         if state != JobState::Succeeded {
@@ -291,7 +291,7 @@ impl Engine {
     /// What waits and what runs.
     ///
     /// # Errors
-    /// [`Error::Internal`].
+    /// [`Error::Store`].
     pub async fn queue_stats(&self) -> Result<QueueStats, Error> {
         Ok(self.inner.store.queue_stats().await?)
     }

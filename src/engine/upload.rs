@@ -151,8 +151,8 @@ impl Upload {
     /// Stores bytes at the end.
     ///
     /// # Errors
-    /// [`StoreError::UploadTakenOver`] where another stream goes on with the upload, [`StoreError::UploadNotFound`] where it was given
-    /// up, [`Error::Draining`] once they are stored.
+    /// [`StoreError::UploadTakenOver`] where another stream goes on with the upload, [`StoreError::UploadNotFound`]
+    /// where it was given up, [`Error::Draining`] once they are stored.
     pub async fn append(&mut self, data: &[u8]) -> Result<(), Error> {
         let store = &self.engine.inner.store;
         store.append_upload(&self.lease, self.committed, data, self.engine.inner.now()).await?;

@@ -53,7 +53,7 @@ pub(super) struct AttemptHandle {
     pub started: oneshot::Receiver<Started>,
     pub progress: watch::Receiver<Option<Progress>>,
     /// Dropped unanswered where the thread is gone, or a prefetched job was not begun.
-    pub report: oneshot::Receiver<(End, Attempt)>,
+    pub report: oneshot::Receiver<(AttemptOutcome, Attempt)>,
 }
 
 /// An assignment on its way to the thread, with where it answers.
@@ -61,14 +61,14 @@ pub(super) struct Assigned {
     assignment: Assignment,
     started: oneshot::Sender<Started>,
     progress: watch::Sender<Option<Progress>>,
-    reply: oneshot::Sender<(End, Attempt)>,
+    reply: oneshot::Sender<(AttemptOutcome, Attempt)>,
 }
 
 /// What an attempt came to; `None`: it was interrupted, and its job goes back to the queue.
-pub(super) type End = Option<Outcome>;
+pub(super) type AttemptOutcome = Option<Outcome>;
 
 /// Of an attempt that was told to stop.
-pub(super) fn stopped(reason: StopReason) -> End {
+pub(super) fn stopped(reason: StopReason) -> AttemptOutcome {
     match reason {
         StopReason::Cancelled => Some(Outcome::Cancelled),
         StopReason::DeadlineExceeded => Some(Outcome::DeadlineExceeded),
@@ -77,7 +77,7 @@ pub(super) fn stopped(reason: StopReason) -> End {
 }
 
 /// Of a defect: the solver's error, a panic, an input that cannot be read.
-pub(super) fn broken(message: impl Into<String>) -> End {
+pub(super) fn failed(message: impl Into<String>) -> AttemptOutcome {
     Some(Outcome::Failed(Failure::new(INTERNAL, message)))
 }
 
@@ -88,7 +88,7 @@ pub(super) struct Worker {
 }
 
 impl Worker {
-    /// Starts a thread. `alive` is dropped when the thread ends.
+    /// Starts a thread. `alive` is dropped once the thread has dropped its solver.
     ///
     /// # Errors
     /// When the system has no thread to give.
@@ -98,9 +98,11 @@ impl Worker {
         encode: ResultEncoder,
         alive: mpsc::Sender<()>,
     ) -> std::io::Result<Self> {
-        let (assignments, mut inbox) = mpsc::channel::<Assigned>(1);
+        let (assignments, inbox) = mpsc::channel::<Assigned>(1);
         thread::Builder::new().name(format!("solver-{index}")).stack_size(STACK_BYTES).spawn(move || {
+            // Dropped in reverse order.
             let _alive = alive;
+            let (solver, mut inbox) = (solver, inbox);
             while let Some(assigned) = inbox.blocking_recv() {
                 work(assigned, &solver, encode);
             }
@@ -137,7 +139,7 @@ struct Opened {
     settings: SolveSettings,
     stop: StopToken,
     reporter: Reporter,
-    reply: oneshot::Sender<(End, Attempt)>,
+    reply: oneshot::Sender<(AttemptOutcome, Attempt)>,
 }
 
 impl Assigned {
@@ -165,7 +167,7 @@ fn work(assigned: Assigned, solver: &Solver, encode: ResultEncoder) {
     let span = reporter.attempt.span().clone();
     let _entered = span.enter();
     let end = catch_unwind(AssertUnwindSafe(|| solve(input, &settings, &mut reporter, &stop, solver, encode)))
-        .unwrap_or_else(|panic| broken(format!("the solver panicked: {}", panic_message(panic.as_ref()))));
+        .unwrap_or_else(|panic| failed(format!("the solver panicked: {}", panic_message(panic.as_ref()))));
     reporter.attempt.at_rest();
     // Nobody listens any more when the engine went down with its runtime; the store then tells the next start.
     let _ = reply.send((end, reporter.attempt));
@@ -178,10 +180,10 @@ fn solve(
     stop: &StopToken,
     solver: &Solver,
     encode: ResultEncoder,
-) -> End {
+) -> AttemptOutcome {
     let decoded: Input = match payload::decode(&input, "the job's input") {
         Ok(decoded) => decoded,
-        Err(error) => return broken(error.to_string()),
+        Err(error) => return failed(error.to_string()),
     };
     drop(input);
     match solver(&decoded, settings, reporter, stop) {
@@ -190,7 +192,7 @@ fn solve(
             Some(Outcome::Succeeded { summary: summarise(&solution, result.bytes.len() as u64), result })
         }
         Err(solver::Error::Stopped(reason)) => stopped(reason),
-        Err(solver::Error::Internal(message)) => broken(message),
+        Err(solver::Error::Internal(message)) => failed(message),
     }
 }
 
@@ -256,7 +258,7 @@ impl Observer for Reporter {
 pub(super) struct Simulated {
     reporter: Reporter,
     stop: StopToken,
-    reply: oneshot::Sender<(End, Attempt)>,
+    reply: oneshot::Sender<(AttemptOutcome, Attempt)>,
 }
 
 #[cfg(test)]
@@ -295,10 +297,10 @@ impl Simulated {
 
     /// Ends with a defect, unless it was stopped.
     pub(super) fn fail(self) {
-        self.end(broken("told to fail"));
+        self.end(failed("told to fail"));
     }
 
-    fn end(self, end: End) {
+    fn end(self, end: AttemptOutcome) {
         let end = self.stop.reason().map_or(end, stopped);
         // Nobody listens any more where the engine went down.
         let _ = self.reply.send((end, self.reporter.attempt));

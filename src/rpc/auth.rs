@@ -9,13 +9,13 @@ use tonic::body::Body;
 use tonic::codegen::http::header::{AUTHORIZATION, CONTENT_TYPE};
 use tonic::codegen::http::{HeaderMap, Method, Request};
 
-use super::access_log::{self, CallRecord};
+use super::access_log::CallRecord;
 use super::caller::{Caller, Tenant};
 use super::keys::{Grant, Hash, KeyRing};
 use super::listener::ConnectionInfo;
 use super::rates::Rates;
 use super::reload::Current;
-use super::status;
+use super::{methods, status};
 
 /// What needs no key: whoever spreads calls over servers asks for their health, and has no tenant.
 const OPEN: &str = "/grpc.health.v1.Health/";
@@ -71,7 +71,7 @@ impl Authenticate {
         let hash = key.0.as_ref().map(|accepted| &accepted.key);
         record.identify(tenant.id(), hash.map(Hash::fingerprint));
         // Without keys everyone may do everything.
-        let needed = access_log::scope_of(request.uri().path());
+        let needed = methods::scope_of(request.uri().path());
         if key.0.as_ref().is_some_and(|accepted| accepted.grant.scope < needed) {
             return Err(status::scope_missing(needed));
         }

@@ -16,6 +16,7 @@ pub mod inputs;
 pub mod jobs;
 pub mod keys;
 pub mod listener;
+mod methods;
 pub mod proto;
 pub mod rates;
 pub mod reload;

@@ -29,6 +29,8 @@ use crate::domain::job::JobName;
 
 /// Target of the access log: one line a call.
 pub const ACCESS: &str = "scpsfm::access";
+/// Target of refused calls.
+pub const REFUSED: &str = "scpsfm::refused";
 
 /// Target of the audit log: who created, cancelled, deleted or uploaded what. Always written.
 pub const AUDIT: &str = "scpsfm::audit";

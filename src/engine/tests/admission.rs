@@ -67,11 +67,16 @@ async fn bad_arguments_name_their_field() {
     let mut bad = new_job(Behavior::Succeed);
     bad.settings.alpha = f64::NAN;
     assert_eq!(fields(test.engine.submit(bad).await.expect_err("refused")), ["job.settings.alpha"]);
-    let query = JobQuery { page_token: Some("x".into()), ..JobQuery::default() };
-    assert_eq!(test.engine.list(&query).await, Err(StoreError::PageToken.into()));
     let name = test.submit(Behavior::Succeed).await;
     let last = test.ended(&name).await.last_sequence;
     assert_eq!(fields(test.engine.watch(&name, last + 1).await.expect_err("refused")), ["after_sequence"]);
+}
+
+#[tokio::test]
+async fn a_page_token_of_no_page_is_refused() {
+    let test = TestEngine::start(workers(1)).await;
+    let query = JobQuery { page_token: Some("x".into()), ..JobQuery::default() };
+    assert_eq!(test.engine.list(&query).await, Err(StoreError::PageToken.into()));
 }
 
 #[tokio::test]

@@ -36,15 +36,15 @@ pub fn files(scratch: &Path) -> PathBuf {
 struct ResultFile {
     grade: Option<String>,
     status: String,
-    #[serde(deserialize_with = "json::positive")]
+    #[serde(default, deserialize_with = "json::positive")]
     focal_px: Option<f64>,
-    #[serde(deserialize_with = "json::not_negative")]
+    #[serde(default, deserialize_with = "json::not_negative")]
     sigma_log_focal: Option<f64>,
     radial_k1: Option<f64>,
     registered_views: usize,
-    #[serde(deserialize_with = "json::not_negative")]
+    #[serde(default, deserialize_with = "json::not_negative")]
     reprojection_mean_px: Option<f64>,
-    #[serde(deserialize_with = "json::not_negative")]
+    #[serde(default, deserialize_with = "json::not_negative")]
     reprojection_rms_px: Option<f64>,
     warnings: Vec<WarningEntry>,
 }
