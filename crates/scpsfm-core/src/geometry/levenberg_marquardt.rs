@@ -34,7 +34,8 @@ pub(crate) trait LeastSquares {
 
     /// Solves the normal equations, damped relative to their diagonal, and moves `from` by the solution into `to`.
     ///
-    /// Returns the decrease of the cost that the linearisation predicts; `None` where the system has no solution.
+    /// Returns the decrease of the cost that the linearisation predicts, not a number where that is not known; `None`
+    /// where the system has no solution.
     fn step(&mut self, from: &Self::State, damping: f64, to: &mut Self::State) -> Option<f64>;
 
     /// The same with what the state moved to costs; may improve on a step that does not cost less than `present`.
@@ -141,7 +142,8 @@ fn is_hopeless(before: f64, cost: f64, left: usize, hopeless_above: f64) -> bool
     cost * (cost / before).powf(left as f64 / PACE_STEPS as f64) > hopeless_above
 }
 
-/// Nielsen's factor on the damping after a step that gained this share of what was predicted.
+/// Nielsen's factor on the damping after a step that gained this share of what was predicted; the least where that is
+/// not a number.
 fn factor_after(gain_ratio: f64) -> f64 {
     let (least, most) = ACCEPTED_FACTORS;
     (1.0 - (2.0 * gain_ratio - 1.0).powi(3)).max(least).min(most)
@@ -288,5 +290,6 @@ mod tests {
         assert_eq!(factor_after(1.0), 0.2);
         assert_eq!(factor_after(0.5), 1.0);
         assert_eq!(factor_after(0.0), 2.0);
+        assert_eq!(factor_after(f64::NAN), 0.2);
     }
 }

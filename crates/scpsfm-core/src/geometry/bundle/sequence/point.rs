@@ -41,29 +41,14 @@ impl PointBlock {
     #[inline(always)]
     pub fn factor(&self, damping: f64) -> Option<PointFactor> {
         let [m00, m10, m20, m11, m21, m22] = self.matrix;
-        let [d0, d1, d2] = self.damping(damping);
-        let inverse_root = |value: f64| (value > 0.0 && value.is_finite()).then(|| value.sqrt().recip());
-        let l00 = inverse_root(m00 + d0)?;
-        let (l10, l20) = (m10 * l00, m20 * l00);
-        let l11 = inverse_root(m11 + d1 - l10 * l10)?;
-        let l21 = (m21 - l20 * l10) * l11;
-        let l22 = inverse_root(m22 + d2 - l20 * l20 - l21 * l21)?;
-        Some(PointFactor([l00, l10, l20, l11, l21, l22]))
-    }
-
-    /// What Marquardt's damping adds to the diagonal.
-    #[inline(always)]
-    fn damping(&self, damping: f64) -> [f64; POINT] {
-        let [m00, _, _, m11, _, m22] = self.matrix;
         let least = POINT_DAMPING * (m00 + m11 + m22) + f64::MIN_POSITIVE;
-        [m00, m11, m22].map(|diagonal| damping * diagonal + least)
-    }
-
-    /// The share of this point in the decrease of the linearised cost, see
-    /// [`Reduced::predicted`](super::reduced::Reduced::predicted).
-    pub fn predicted(&self, step: &Vector3<f64>, damping: f64) -> f64 {
-        let added = self.damping(damping);
-        (0..POINT).map(|k| step[k] * (added[k] * step[k] - self.gradient[k])).sum()
+        let inverse_root = |value: f64| (value > 0.0 && value.is_finite()).then(|| value.sqrt().recip());
+        let l00 = inverse_root(m00 + damping * m00 + least)?;
+        let (l10, l20) = (m10 * l00, m20 * l00);
+        let l11 = inverse_root(m11 + damping * m11 + least - l10 * l10)?;
+        let l21 = (m21 - l20 * l10) * l11;
+        let l22 = inverse_root(m22 + damping * m22 + least - l20 * l20 - l21 * l21)?;
+        Some(PointFactor([l00, l10, l20, l11, l21, l22]))
     }
 }
 

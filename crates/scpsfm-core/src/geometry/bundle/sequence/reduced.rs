@@ -10,7 +10,7 @@ use super::super::panel::{self, PANEL_SHARE};
 use super::MetricReconstruction;
 use super::grouped::Grouped;
 use super::layout::Layout;
-use super::normal::{Cameras, Normal};
+use super::normal::Normal;
 use super::pattern::{Column, Pattern};
 use super::solver::Solver;
 use super::worker_pool::{WorkerPool, split_off};
@@ -157,29 +157,17 @@ impl Reduced {
     /// Marquardt's damping, and what holds the gauge.
     pub fn damp(&mut self, normal: &Normal, damping: f64) {
         for &index in &normal.cameras.diagonal {
-            self.values[index] += damping_of(normal.cameras.values[index], damping);
+            let diagonal = normal.cameras.values[index];
+            // Nothing is known of this unknown: it stays where it is.
+            let undetermined = if diagonal > 0.0 { 0.0 } else { 1.0 };
+            self.values[index] += (damping + GAUGE_DAMPING) * diagonal + undetermined;
         }
-    }
-
-    /// Decrease of the linearised cost by the step of poses and intrinsics, without the share of the points:
-    /// `x' (D x - g)` for a step `x` with `(H + D) x = -g`.
-    pub fn predicted(&self, normal: &Normal, damping: f64) -> f64 {
-        let Cameras { values, diagonal, gradient, .. } = &normal.cameras;
-        let unknowns = self.vector.iter().zip(gradient).zip(diagonal);
-        unknowns.map(|((x, gradient), &index)| x * (damping_of(values[index], damping) * x - gradient)).sum()
     }
 
     /// Solves for the step in place of the right-hand side; `false` when the system is not positive definite.
     pub fn solve(&mut self, solver: &mut Solver) -> bool {
         solver.solve(&mut self.values, &mut self.vector) && self.vector.iter().all(|value| value.is_finite())
     }
-}
-
-/// What is added to a diagonal entry of this value: Marquardt's damping, and what holds the gauge.
-fn damping_of(diagonal: f64, damping: f64) -> f64 {
-    // Nothing is known of such an unknown: it stays where it is.
-    let undetermined = if diagonal > 0.0 { 0.0 } else { 1.0 };
-    (damping + GAUGE_DAMPING) * diagonal + undetermined
 }
 
 impl Points<'_> {
@@ -283,8 +271,7 @@ impl Columns<'_> {
 }
 
 /// Moves the points of `moved` to where they belong after the step of poses and intrinsics: from where they are in
-/// `from` by `-V^-1 (Jp' r + Jp' Jc dc)`. Returns their share of the decrease of the linearised cost, see
-/// [`Reduced::predicted`]; `None` when that is no number, or it was stopped.
+/// `from` by `-V^-1 (Jp' r + Jp' Jc dc)`. `false` when that is no number, or it was stopped.
 pub(super) fn substitute(
     moved: &mut MetricReconstruction,
     from: &MetricReconstruction,
@@ -292,11 +279,11 @@ pub(super) fn substitute(
     damping: f64,
     step: &[f64],
     pool: &WorkerPool,
-) -> Option<f64> {
+) -> bool {
     let layout = pool.layout;
     let place = |point: usize| {
         if layout.seen(point).is_empty() || !layout.free_points[point] {
-            return Some((from.points[point], 0.0));
+            return Some(from.points[point]);
         }
         let block = &normal.points[point];
         let factor = block.factor(damping)?;
@@ -309,13 +296,10 @@ pub(super) fn substitute(
                 gradient[k] += dot(column, step);
             }
         }
-        let shift = -factor.unwhiten(&factor.whiten(&gradient));
-        let predicted = block.predicted(&shift, damping);
-        shift.iter().all(|value| value.is_finite()).then(|| (from.points[point] + shift, predicted))
+        let shift: Vector3<f64> = factor.unwhiten(&factor.whiten(&gradient));
+        shift.iter().all(|value| value.is_finite()).then(|| from.points[point] - shift)
     };
-    let (points, predicted): (Vec<_>, Vec<f64>) = pool.of_points(place)?.into_iter().unzip();
-    moved.points = points;
-    Some(predicted.iter().sum())
+    pool.of_points(place).map(|points| moved.points = points).is_some()
 }
 
 #[inline(always)]
