@@ -151,8 +151,8 @@ impl TenantArg {
 
 impl Args for TenantArg {
     fn augment_args(command: Command) -> Command {
-        let help = "Tenant of the jobs; a full name of another tenant is then refused [default: that of the API key; \
-                    without a key `default`]";
+        let help = "Tenant of the jobs; beside this flag, not the variable, a full name of another tenant is refused \
+                    [default: that of the API key; without a key `default`]";
         let arg = Arg::new(Self::ID).long(Self::ID).help_heading(ACCESS).value_name("ID").env("SCPSFM_TENANT");
         command.arg(arg.help(help))
     }

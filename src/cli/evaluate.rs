@@ -13,7 +13,7 @@ use super::evaluate_observations::{self, ObservationArgs};
 use super::evaluate_photographed::{self, PhotographedArgs};
 use super::evaluate_priors::{self, PriorArgs};
 use super::evaluate_real::{self, RealArgs};
-use super::evaluate_suite::{SceneFilter, SuiteRunner};
+use super::evaluate_suite::{MOST_SEEDS, SceneFilter, SuiteRunner};
 use super::exit::{self, Exit, Failure};
 use super::prior_file::PriorFileArgs;
 use crate::domain::{SolveSettings, counted};
@@ -73,7 +73,7 @@ pub struct Args {
     pub out: PathBuf,
 
     /// Scenes a cell [default: 20, with --quick 4, with --photographed 300 in all, with --long 1]
-    #[arg(long, value_name = "N", value_parser = clap::value_parser!(u64).range(1..=10_000))]
+    #[arg(long, value_name = "N", value_parser = clap::value_parser!(u64).range(1..=MOST_SEEDS))]
     pub seeds: Option<u64>,
 
     /// A first impression: 4 seeds, and of the sweeps only cells that take less than a few seconds
@@ -211,8 +211,7 @@ pub async fn run(args: Args) -> Result<Exit, Failure> {
     if args.photographed.photographed {
         let seeds = args.seeds.unwrap_or(evaluate_photographed::SEEDS);
         let first = args.photographed.first_seed;
-        let seeds = first..first.saturating_add(seeds);
-        return evaluate_photographed::run(&scenes, seeds, args.real.peer_words()?, &suite);
+        return evaluate_photographed::run(&scenes, first..first + seeds, args.real.peer_words()?, &suite);
     }
     if args.long.long {
         // One after the other: the memory is that of one solve.
@@ -332,6 +331,7 @@ mod tests {
     fn photographed_scenes_are_a_suite_of_their_own() {
         assert!(parse(&["--photographed", "--seeds", "3", "--scenes", "orbit", "--peer", "peer"]).is_ok());
         assert!(parse(&["--photographed", "--first-seed", "5"]).is_ok());
+        assert!(parse(&["--photographed", "--first-seed", &u64::MAX.to_string()]).is_err(), "none would be left");
         assert!(parse(&["--first-seed", "5"]).is_err(), "other suites have seeds of their own");
         for none in ["", ",", ",,"] {
             let error = parse(&["--photographed", "--scenes", none]).err().unwrap_or_else(|| panic!("{none:?}"));

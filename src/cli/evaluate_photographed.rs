@@ -4,7 +4,7 @@ use std::ops::Range;
 
 use serde_json::json;
 
-use super::evaluate_suite::{SuiteRunner, chosen};
+use super::evaluate_suite::{MOST_SEEDS, SuiteRunner, chosen};
 use super::exit::{Exit, Failure};
 use crate::evaluation::observations;
 use crate::evaluation::photographed::{self, Plan, RECORDS, table};
@@ -27,7 +27,8 @@ pub struct PhotographedArgs {
         conflicts_with_all = ["quick", "sweeps", "beyond", "ablation", "depths", "methods", "paper_width"])]
     pub photographed: bool,
     /// First of the --seeds seeds. Use another one to check a result on scenes that the program was not tuned on
-    #[arg(long, value_name = "SEED", default_value_t = photographed::FIRST_SEED, requires = "photographed")]
+    #[arg(long, value_name = "SEED", default_value_t = photographed::FIRST_SEED, requires = "photographed",
+        value_parser = clap::value_parser!(u64).range(..=u64::MAX - MOST_SEEDS))]
     pub first_seed: u64,
 }
 

@@ -44,7 +44,7 @@ pub struct RealArgs {
     pub peer: Vec<String>,
 
     /// Seconds after which the peer is ended on a sequence
-    #[arg(long, value_name = "SECONDS", requires = "real", default_value_t = 600,
+    #[arg(long, value_name = "SECONDS", requires = "peer", default_value_t = 600,
         value_parser = clap::value_parser!(u64).range(1..=1_000_000))]
     pub peer_timeout: u64,
 }

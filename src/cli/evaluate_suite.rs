@@ -17,6 +17,9 @@ use crate::evaluation::records::{self, Records};
 use crate::formats::publish::{create_directory, pretty, write_atomically};
 use scpsfm_core::subspace;
 
+/// Seeds of one evaluation at most: more would take weeks.
+pub const MOST_SEEDS: u64 = 10_000;
+
 /// Which scenes of a suite.
 #[derive(Debug, Clone, clap::Args)]
 pub struct SceneFilter {
@@ -125,13 +128,14 @@ impl SuiteRunner<'_> {
         R: Serialize + DeserializeOwned + Sync,
         M: Serialize + DeserializeOwned + Clone + Send,
     {
+        let stop = StopToken::default();
+        // Before anything else: an interruption while records are read ends in order, too.
+        let interrupt = Interrupt::listen()?;
+        let relay = interrupt.stops(&stop);
         create_directory(self.out)?;
         let mut records: Records<R, M> = Records::open(self.out, name, &build()?)?;
         let done = runs.iter().filter(|run| records.get(run).is_some()).count();
         let bar = RunsView::new(self.quiet, runs.len(), done);
-        let stop = StopToken::default();
-        let interrupt = Interrupt::listen()?;
-        let relay = interrupt.stops(&stop);
         let outcome = tokio::task::block_in_place(|| {
             records.run(runs, self.threads, &stop, &|run| measure(run, &stop), &mut |run| {
                 bar.show(describe(run));

@@ -26,7 +26,7 @@ pub struct Args {
     pub server: ServerArgs,
 
     /// No progress on stderr
-    #[arg(long)]
+    #[arg(long, short)]
     pub quiet: bool,
 }
 

@@ -18,6 +18,7 @@ use super::view_selection::{LEAST_SHARED_BY_PAIR, LEAST_VIEWS};
 use super::{Error, static_tracks};
 use crate::domain::result::{ObservationResults, Sigmas, TrackResults, TrackSplit, TwoViewTrack, ViewResult};
 use crate::domain::second_structure::SecondStructure;
+use crate::domain::words::counted;
 use crate::domain::{Calibration, Grade, Solution, Stage, Status, Warning, WarningCode};
 use crate::geometry::bundle::metric::{Intrinsics, Parameter, Pose};
 use crate::geometry::daq::oriented;
@@ -404,18 +405,18 @@ fn why_unsolved(problem: &Problem, best: Option<&Attempt>) -> Warning {
             Warning::new(
                 WarningCode::UnverifiedRanking,
                 format!(
-                    "the best of the network's heads keeps {} tracks; they are too few, too like wrong ones or too far \
+                    "the best of the network's heads keeps {}; they are too few, too like wrong ones or too far \
                      from one calibration to be verified: `weight` of the tracks is what it gives them, nothing has \
                      checked it",
-                    inlier.iter().filter(|&&inlier| inlier).count()
+                    counted(inlier.iter().filter(|&&inlier| inlier).count(), "track")
                 ),
             )
         }
         Some(Attempt { decided: Some(decided), .. }) => Warning::new(
             WarningCode::FewInliers,
             format!(
-                "the method kept {} tracks; {} determine the cameras",
-                decided.inlier.iter().filter(|&&inlier| inlier).count(),
+                "the method kept {}; {} determine the cameras",
+                counted(decided.inlier.iter().filter(|&&inlier| inlier).count(), "track"),
                 LEAST_SUPPORT
             ),
         ),
