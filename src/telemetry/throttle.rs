@@ -34,7 +34,7 @@ struct Window {
 }
 
 impl Throttle {
-    /// So many lines a minute.
+    /// So many lines a minute, and one more with the number of those that were left out.
     pub fn of(lines: u32) -> Self {
         Self { lines, window: Arc::default() }
     }

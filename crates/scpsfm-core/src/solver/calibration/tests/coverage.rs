@@ -123,9 +123,10 @@ fn sigma_is_the_error_through_distorting_lenses() {
     assert!((0.60..=0.80).contains(&all.within(1.0)), "{:.3} within 1 sigma", all.within(1.0));
 }
 
-/// Distortion that noise hides is not taken, and costs what it would move.
+/// Distortion that noise hides is not taken, and costs what it would move. Where every lens distorts, sigma is still
+/// too small: the average over models expects that half of them do not.
 #[test]
-#[ignore = "1000 calibrations, a minute or two: run it after a change of what sigma is made of"]
+#[ignore = "does not hold yet: .587 of 686 are within 1 sigma, .525 at noise .003; 1000 calibrations, a minute or two"]
 fn sigma_is_the_error_through_lenses_of_low_distortion() {
     let all = all(500, &[LOW_DISTORTION]);
     assert!(all.within(3.0) >= 0.97, "{:.3} within 3 sigma", all.within(3.0));
