@@ -8,10 +8,11 @@ use rand_chacha::ChaCha8Rng;
 use crate::domain::{Input, Proposal, StopToken};
 use crate::geometry::measurement::CompleteBlock;
 use crate::solver::a_contrario::{self, FalseAlarmOptions};
-use crate::solver::grow::{self, Consensus};
+use crate::solver::consensus::Consensus;
+use crate::solver::grow;
 use crate::solver::learned::TrackScores;
-use crate::solver::portfolio::spread;
 use crate::solver::search::{Sampler, Shortlist, affine};
+use crate::solver::spread::spread;
 use crate::solver::{block, priors};
 
 /// Hypotheses of a search that are grown: enough that the ranking of hypotheses is not what is measured.

@@ -4,7 +4,8 @@
 //! calibration more exact, by the root of their number, so what was left aside joins once a consensus stands.
 
 use super::block::Block;
-use super::grow::{self, Consensus, ConsensusOptions};
+use super::consensus::{self, Consensus, ConsensusOptions};
+use super::grow;
 use super::problem::Problem;
 use super::view_selection::evenly;
 use super::{near_duplicates, static_tracks};
@@ -37,9 +38,9 @@ const OPTIONS: AllTracksOptions = AllTracksOptions::DEFAULT;
 /// The block and its consensus with the tracks that the search left aside; `None` where there are none, or where what
 /// was found does not carry over.
 pub fn extend(problem: &Problem, searched: &Block, consensus: &Consensus) -> Option<(Block, Consensus)> {
-    let mut block = near_duplicates::without(problem, problem.block(&searched.views));
+    let mut block = near_duplicates::without(&problem.representative, problem.block(&searched.views));
     let found: Vec<usize> = consensus.inliers().into_iter().map(|track| searched.tracks[track]).collect();
-    let moving = static_tracks::moving(problem, &block);
+    let moving = static_tracks::moving(&problem.is_static, &block);
     if moving.len() < block.tracks.len() && !problem.is_of_static(&found) {
         block = block.select(&moving);
     }
@@ -47,7 +48,7 @@ pub fn extend(problem: &Problem, searched: &Block, consensus: &Consensus) -> Opt
     if all.tracks.len() == searched.tracks.len() {
         return None;
     }
-    let judge = |cameras, noise| grow::judge(&all.complete, cameras, noise, problem.stop);
+    let judge = |cameras, noise| consensus::judge(&all.complete, cameras, noise, problem.stop);
     let mut found = judge(consensus.cameras.clone(), OPTIONS.widenings[0] * consensus.noise);
     let mut before = Vec::new();
     for round in 1..=OPTIONS.most_rounds {
@@ -55,14 +56,14 @@ pub fn extend(problem: &Problem, searched: &Block, consensus: &Consensus) -> Opt
         if round > OPTIONS.widenings.len() && inliers == before {
             break;
         }
-        if inliers.len() < grow::LEAST_INLIERS || problem.stop.is_stopped() {
+        if inliers.len() < consensus::LEAST_INLIERS || problem.stop.is_stopped() {
             return None;
         }
         let noise = grow::estimate_noise(&found, &inliers);
         let support = evenly(&inliers, OPTIONS.most_inliers);
         let mut cameras = found.cameras.clone();
         let mut points: Vec<Point> = support.iter().map(|&track| found.points[track]).collect();
-        let observations = grow::observations_of(&all.complete, &support);
+        let observations = consensus::observations_of(&all.complete, &support);
         let options = bundle::Options {
             max_iterations: OPTIONS.iterations,
             loss: ConsensusOptions::DEFAULT.loss(noise),

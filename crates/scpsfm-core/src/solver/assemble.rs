@@ -7,15 +7,17 @@ use super::attempt::Attempt;
 use super::baselines::Decided;
 use super::calibration::Outcome;
 use super::classification::{self, Judged};
-use super::grow::{LEAST_INLIERS, LEAST_SUPPORT};
+use super::consensus::LEAST_VIEWS;
+use super::consensus::{LEAST_INLIERS, LEAST_SUPPORT};
+use super::error::Error;
 use super::portfolio::Found;
 use super::problem::{Problem, camera_groups};
 use super::reconstruction::{Reconstruction, own_verdicts};
 use super::recorder::Recorder;
 use super::second_structures::{self, Structure};
 use super::sequence::Ended;
-use super::view_selection::{LEAST_SHARED_BY_PAIR, LEAST_VIEWS};
-use super::{Error, static_tracks};
+use super::static_tracks;
+use super::view_selection::LEAST_SHARED_BY_PAIR;
 use crate::domain::result::{ObservationResults, Sigmas, TrackResults, TrackSplit, TwoViewTrack, ViewResult};
 use crate::domain::second_structure::SecondStructure;
 use crate::domain::words::counted;
@@ -74,9 +76,7 @@ impl Assembled {
     fn of(ended: Ended, problem: &Problem, recorder: &mut Recorder) -> Result<Self, Unsolved> {
         let evidence = ended.evidence(problem);
         let (reconstruction, seed) = match ended {
-            Ended::Extended(extended) => {
-                (Some(Reconstruction::of_extended(problem, &extended)), Some(Box::new(extended.seed)))
-            }
+            Ended::Extended(extended) => (Some(extended.reconstruction(problem)), Some(Box::new(extended.seed))),
             Ended::Block(Some(attempt)) => (Reconstruction::of_attempt(problem, &attempt), Some(attempt)),
             Ended::Block(None) => (None, None),
         };
@@ -166,7 +166,7 @@ impl Reconstruction {
             .map(|(number, structure)| second_structures::describe(problem, &self, structure, number))
             .collect::<Result<_, _>>()?;
         warnings.extend(second_structures::warning(&second_structures, &judged.tracks.second_structure, inliers));
-        warnings.extend(static_tracks::warning(problem, &judged.tracks.inlier));
+        warnings.extend(static_tracks::warning(&problem.is_static, &judged.tracks.inlier));
         let frames = self.frames(problem);
         let backs: Vec<Option<Matrix4<f64>>> =
             frames.iter().map(|frame| frame.filter(|_| !self.is_metric())?.try_inverse()).collect();

@@ -1,11 +1,8 @@
 //! The methods without search (PAPER, SCPSFM and PSFM): what they have in common, and plain projective factorisation.
 
-use super::attempt::{self, Attempt, Effort};
-use super::fusion::{self, Estimate};
-use super::grow::{self, Consensus, ConsensusOptions, LEAST_SUPPORT};
+use super::consensus::{self, Consensus, ConsensusOptions, LEAST_SUPPORT};
+use super::grow;
 use super::problem::Problem;
-use super::recorder::Recorder;
-use super::{Error, view_selection};
 use crate::domain::StopToken;
 use crate::geometry::bundle::{self, projective};
 use crate::geometry::epipolar_depths::epipolar_depths;
@@ -26,31 +23,6 @@ pub struct Decided {
     pub weights: Vec<f64>,
     /// Whether the method itself takes its answer for one; else nothing is reconstructed.
     pub is_verified: bool,
-}
-
-/// Solves the densest blocks of views, one at least and until one is METRIC; the best of them. Blocks that disagree
-/// raise its uncertainty; other views are left out.
-///
-/// # Errors
-/// [`Error::Stopped`]; [`Error::Internal`] for defects.
-pub fn solve(problem: &Problem, recorder: &mut Recorder) -> Result<Option<Attempt>, Error> {
-    let candidates = view_selection::candidate_views(problem);
-    let mut attempts: Vec<Attempt> = Vec::new();
-    for (k, views) in candidates.iter().enumerate() {
-        problem.stopped()?;
-        recorder.begin_block(k, candidates.len());
-        attempts.push(attempt::solve_block(problem, problem.block(views), Effort::default(), &[], recorder)?);
-        // A good block is still checked against a second one.
-        if k > 0 && attempts.iter().any(Attempt::is_good) {
-            break;
-        }
-    }
-    let estimates: Vec<Estimate> = attempts.iter().filter_map(Attempt::estimate).collect();
-    let mut best = attempts.into_iter().reduce(|best, other| if other.merit() > best.merit() { other } else { best });
-    if let Some(outcome) = best.as_mut().and_then(|best| best.calibration.as_mut()) {
-        fusion::admit_misfit(outcome, &estimates, &problem.calibration_options.grades);
-    }
-    Ok(best)
 }
 
 /// The block completed with depths from epipolar geometry, where the settings ask for them and the input has none: what
@@ -90,7 +62,7 @@ pub fn reconstruct(block: &CompleteBlock, inlier: &[bool], noise: f64, stop: &St
     let matrix = balance(&block.measurement_matrix()).select_columns(&support);
     let mut cameras = cameras_of(&dominant_subspace(&matrix, RANK)?);
     let mut points: Vec<_> = support.iter().map(|&track| triangulation::linear(&cameras, block.track(track))).collect();
-    let observations = grow::observations_of(block, &support);
+    let observations = consensus::observations_of(block, &support);
     let mut consensus = None;
     let mut noise = noise;
     // Once at the noise assumed, once at that of the set itself.
@@ -101,7 +73,7 @@ pub fn reconstruct(block: &CompleteBlock, inlier: &[bool], noise: f64, stop: &St
             ..Default::default()
         };
         projective::adjust(&mut cameras, &mut points, &observations, &options, stop);
-        let judged = grow::judge(block, cameras.clone(), noise, stop);
+        let judged = consensus::judge(block, cameras.clone(), noise, stop);
         noise = grow::estimate_noise(&judged, &support);
         consensus = Some(Consensus { inlier: inlier.to_vec(), noise, ..judged });
     }

@@ -7,11 +7,11 @@ use super::all_tracks::AllTracksOptions;
 use super::block::Block;
 use super::calibration::{Outcome, few_inliers};
 use super::classification::{ClassificationOptions, Geometry, Judged};
-use super::grow::{Consensus, NoiseOptions};
-use super::portfolio;
+use super::consensus::{Consensus, NoiseOptions};
 use super::problem::Problem;
 use super::search::Seed;
 use super::search::rigid::{Rigid, RigidSearch};
+use super::spread;
 use crate::domain::{Grade, Warning, WarningCode};
 use crate::geometry::bundle::metric::{
     self, Information, Intrinsics, IntrinsicsModel, IntrinsicsPrior, MetricReconstruction, Parameter, Pose,
@@ -91,7 +91,7 @@ pub fn calibrate(problem: &Problem, block: &CompleteBlock, consensus: &Consensus
         outcome.warnings.push(Warning::new(code, detail));
         outcome
     };
-    let observations: Vec<Observation> = super::grow::observations_of(block, &inliers);
+    let observations: Vec<Observation> = super::consensus::observations_of(block, &inliers);
     let model = IntrinsicsModel::FOCAL;
     let unknowns = 6 * block.views() + 3 * inliers.len() + model.parameters().len() - SIMILARITY;
     let freedom = (2 * observations.len()).saturating_sub(unknowns);
@@ -163,7 +163,7 @@ pub fn weights(
 ) -> Option<TrackWeights> {
     let all = problem.block(&searched.views).sample_with(OPTIONS.most_weighed, problem.settings.seed, &searched.tracks);
     let block = &all.complete;
-    let search = RigidSearch::new(block, portfolio::spread(block), problem.stop)?;
+    let search = RigidSearch::new(block, spread::spread(block), problem.stop)?;
     let place = |track: usize| all.tracks.binary_search(&searched.tracks[track]).ok();
     let inliers: Vec<usize> = consensus.inliers().into_iter().filter_map(place).collect();
     let rigid = search.refit(found?, &inliers)?;

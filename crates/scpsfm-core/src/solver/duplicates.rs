@@ -3,7 +3,7 @@
 //! Duplicates of one wrong track agree with each other on any geometry: eight of them verify what nothing else does.
 //! They count once, and all get the answer of the first.
 
-use super::Error;
+use super::error::Error;
 use crate::domain::duplicates::Duplicates;
 use crate::domain::result::ObservationResults;
 use crate::domain::{Input, Observer, Progress, Solution, Stage};

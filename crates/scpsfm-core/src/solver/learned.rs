@@ -4,7 +4,7 @@
 //! must verify. What it disbelieves counts only where geometry has little to go by ([`TrackScores::counted`]). What its
 //! odds are worth in the score of hypotheses comes from `scpsfm evaluate --priors --sweep`.
 
-use super::grow::LEAST_INLIERS;
+use super::consensus::LEAST_INLIERS;
 use crate::domain::{Method, Proposal, SolveSettings};
 use crate::geometry::measurement::CompleteBlock;
 use crate::network::subspace::{self, Cloud, MOST_VIEWS};

@@ -1,6 +1,6 @@
 //! How much memory a solve takes at most, from the shape of its input: for those who bound what runs at once.
 
-use super::grow::LEAST_INLIERS;
+use super::consensus::LEAST_INLIERS;
 
 /// The networks' arrays: the trained one is asked about some 50,000 observations at a time, which takes 100 MB, the
 /// paper's has less.

@@ -5,11 +5,12 @@
 //! The way through: [`duplicates`] keeps one of equal tracks; [`problem`] is the input as all stages see it, in which
 //! one track represents its [`near_duplicates`] until all are judged; [`view_selection`] chooses views whose tracks are
 //! complete: all of them, or a few; [`attempt`] searches such a block, its [`static_tracks`] last, by [`portfolio`]
-//! (proposals, [`search`], [`grow`]; the [`track_sampling`] of many tracks searched, [`a_contrario`] verifies,
-//! [`all_tracks`] join; [`depths`] where those verify what image points cannot), [`scpsfm`] or [`baselines`], and
-//! [`calibration`] upgrades it. [`sequence`] tries blocks in order of cost and extends what stands to the other views
-//! and tracks, projectively or metrically, observation by observation; [`assemble`] has [`classification`] judge every
-//! track and observation, has [`second_structures`] search what is left out, and writes it down.
+//! (proposals, [`search`], [`grow`] to a [`consensus`]; the [`track_sampling`] of many tracks searched, [`a_contrario`]
+//! verifies, [`all_tracks`] join; [`depths`] where those verify what image points cannot), [`scpsfm`] or [`baselines`],
+//! and [`calibration`] upgrades it. [`sequence`] tries blocks in order of cost and extends what stands to the other
+//! views and tracks, projectively or metrically, observation by observation; [`assemble`] has [`classification`] judge
+//! every track and observation by the [`noise_model`], has [`second_structures`] search what is left out, and writes it
+//! down. A module depends on none that depends on it; what several need stands apart.
 
 pub(crate) mod a_contrario;
 mod all_tracks;
@@ -19,25 +20,30 @@ mod baselines;
 pub(crate) mod block;
 pub(crate) mod calibration;
 mod classification;
+pub(crate) mod consensus;
 mod depths;
 mod duplicates;
+mod error;
 mod fusion;
 pub(crate) mod grow;
 mod known_focal;
 pub(crate) mod learned;
 mod memory;
 mod near_duplicates;
+mod noise_model;
 pub(crate) mod normalization;
 mod per_track;
 pub(crate) mod portfolio;
 pub(crate) mod priors;
 mod problem;
+mod projective;
 mod reconstruction;
 mod recorder;
 mod scpsfm;
 pub(crate) mod search;
 mod second_structures;
 mod sequence;
+pub(crate) mod spread;
 mod static_tracks;
 #[cfg(test)]
 mod tests;
@@ -46,30 +52,13 @@ mod view_selection;
 mod views;
 
 use crate::domain::duplicates::Duplicates;
-use crate::domain::{Input, Observer, Sha256Digest, Solution, SolveSettings, StopReason, StopToken};
+use crate::domain::{Input, Observer, Sha256Digest, Solution, SolveSettings, StopToken};
 use crate::parallel::Threads;
+pub use error::Error;
 pub use memory::estimated_bytes;
 use problem::Problem;
 use recorder::Recorder;
 use sequence::Ended;
-
-/// Why a solve ended without a solution. A scene that cannot be solved is a solution, not an error.
-#[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
-pub enum Error {
-    /// The stop token asked for it.
-    #[error("stopped before a result stood: {0:?}")]
-    Stopped(StopReason),
-    /// A defect of ours, not of the input.
-    #[error("internal solver error: {0}")]
-    Internal(String),
-}
-
-impl Error {
-    /// `Err` once the token asks for a stop.
-    fn check(stop: &StopToken) -> Result<(), Self> {
-        stop.reason().map_or(Ok(()), |reason| Err(Self::Stopped(reason)))
-    }
-}
 
 /// Solves one input on the caller's thread; see [`solve_on`].
 ///
@@ -139,7 +128,7 @@ fn solve_views(
     let mut recorder = Recorder::new(observer, problem.observed_views().len());
     let ended = match problem.is_searched() {
         true => sequence::solve(&mut problem, &mut recorder)?,
-        false => Ended::Block(baselines::solve(&problem, &mut recorder)?.map(Box::new)),
+        false => Ended::Block(attempt::solve_densest(&problem, &mut recorder)?.map(Box::new)),
     };
     problem.stopped()?;
     let solution = assemble::solution(ended, &problem, recorder)?;

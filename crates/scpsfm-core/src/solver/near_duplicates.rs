@@ -11,9 +11,9 @@ use std::ops::Range;
 use nalgebra::Vector2;
 
 use super::block::Block;
-use super::grow::LEAST_INLIERS;
-use super::problem::{Problem, VERIFIED};
+use super::consensus::LEAST_INLIERS;
 use crate::domain::StopToken;
+use crate::domain::VERIFIED;
 
 options! {
     /// What counts as near-duplicates.
@@ -154,8 +154,16 @@ impl<'a, V: Fn(usize) -> usize> Tracks<'a, V> {
 }
 
 /// The block without what others represent.
-pub fn without(problem: &Problem, block: Block) -> Block {
-    let kept: Vec<usize> = (0..block.tracks.len()).filter(|&k| !problem.is_near_duplicate(block.tracks[k])).collect();
+///
+/// * `representative`: that of each track of the input
+pub fn without(representative: &[usize], block: Block) -> Block {
+    let kept: Vec<usize> = block
+        .tracks
+        .iter()
+        .enumerate()
+        .filter(|(_, track)| representative[**track] == **track)
+        .map(|(k, _)| k)
+        .collect();
     if kept.len() == block.tracks.len() { block } else { block.select(&kept) }
 }
 

@@ -1,19 +1,19 @@
 //! An input as every stage sees it: normalised, by view and by track, its views in cameras that have a calibration
 //! each.
 
+use super::noise_model;
 use std::collections::BTreeSet;
 
 use nalgebra::Vector2;
 
-use super::attempt::AttemptOptions;
 use super::block::{self, Block};
 use super::calibration::CalibrationOptions;
-use super::grow::NoiseOptions;
+use super::consensus::{LEAST_INLIERS, LEAST_VIEWS, NoiseOptions};
+use super::error::Error;
 use super::known_focal::{KnownFocal, known_focal};
 use super::normalization::normalization;
-use super::view_selection::complete_views;
-use super::{Error, classification, near_duplicates, static_tracks};
-use crate::domain::{FocalPrior, Input, Method, SolveSettings, StopToken, View, Warning, WarningCode};
+use super::{near_duplicates, static_tracks};
+use crate::domain::{FocalPrior, Input, Method, SolveSettings, StopToken, VERIFIED, View, Warning, WarningCode};
 use crate::geometry::bundle::metric::Intrinsics;
 use crate::geometry::measurement::Normalization;
 use crate::geometry::observation::Observation;
@@ -23,9 +23,6 @@ use crate::parallel::Threads;
 /// Share of its observations that a complete track must retain: of 100 permuted tracks in ten views about one holds
 /// three observations of one point by chance, and in fifty views nearly all do.
 pub const LEAST_RETAINED_SHARE: f64 = 0.6;
-
-/// Observations that make a point and verify it: two and one.
-pub use crate::domain::VERIFIED;
 
 /// What every stage of one solve works on; observations keep the input's sorted order (track, view).
 pub struct Problem<'a> {
@@ -180,7 +177,7 @@ impl<'a> Problem<'a> {
             of_view.iter().map(|seen| seen.iter().copied().filter(is_distinct).collect()).collect();
         Self {
             focal_priors: known.iter().map(|known| known.as_ref().map(|known| known.prior)).collect(),
-            outlier_density: classification::outlier_density(&distinct, &xy),
+            outlier_density: noise_model::outlier_density(&distinct, &xy),
             least_share: if complete_views(input, &ranges).is_some() { LEAST_RETAINED_SHARE } else { 0.0 },
             is_static: match is_searched(settings) {
                 true => static_tracks::find(&ranges, &xy),
@@ -232,7 +229,7 @@ impl<'a> Problem<'a> {
 
     /// Squared residual, normalised units, within which an observation agrees with its point at this noise.
     pub fn gate(&self, noise: f64) -> f64 {
-        classification::working_gate(noise, self.outlier_density)
+        noise_model::working_gate(noise, self.outlier_density)
     }
 
     /// The tracks that are complete over these views.
@@ -313,7 +310,7 @@ impl<'a> Problem<'a> {
 }
 
 fn initial_noise(settings: &SolveSettings, scale_px: f64) -> f64 {
-    let noise = settings.noise_px.map_or(AttemptOptions::DEFAULT.initial_noise, |noise_px| noise_px / scale_px);
+    let noise = settings.noise_px.map_or(NoiseOptions::DEFAULT.initial, |noise_px| noise_px / scale_px);
     NoiseOptions::DEFAULT.clamp(noise)
 }
 
@@ -364,6 +361,15 @@ fn weights(input: &Input) -> Vec<f64> {
     let mut sigmas: Vec<f64> = (0..count).filter_map(|k| input.sigma_px(k)).collect();
     let typical = median(&mut sigmas);
     (0..count).map(|k| input.sigma_px(k).map_or(1.0, |sigma| (typical / sigma).powi(2))).collect()
+}
+
+/// The views in which anything is observed, if at least half of the tracks that are observed at all, and enough of
+/// them, are seen in all of these. Padding, views and tracks without observations, changes nothing.
+pub fn complete_views(input: &Input, ranges: &[usize]) -> Option<Vec<usize>> {
+    let views = observed_views(input);
+    let observed = ranges.windows(2).filter(|range| range[1] > range[0]).count();
+    let complete = ranges.windows(2).filter(|range| range[1] - range[0] == views.len()).count();
+    (views.len() >= LEAST_VIEWS && complete >= LEAST_INLIERS && 2 * complete >= observed).then_some(views)
 }
 
 /// The views in which anything is observed, increasing.

@@ -9,7 +9,6 @@ use super::classification::{self, Geometry, Judged};
 use super::depths::DepthOptions;
 use super::problem::{Problem, camera_groups};
 use super::recorder::Recorder;
-use super::sequence::{Extended, component_of_track, verified};
 use crate::domain::result::TrackResults;
 use crate::domain::{Grade, LeftOut, Warning};
 use crate::geometry::bundle::metric::{Intrinsics, MetricReconstruction, Pose};
@@ -84,43 +83,6 @@ impl Reconstruction {
         })
     }
 
-    pub fn of_extended(problem: &Problem, extended: &Extended) -> Self {
-        let Extended { seed, model, calibrations, left_out } = extended;
-        let grade = extended.grade(problem);
-        let is_reported = |view: &usize| grade != Grade::ProjectiveOnly && model.is_determined(*view);
-        let component = |track: usize| match &model.landmarks[problem.representative[track]] {
-            Some(landmark) => landmark.component,
-            None => component_of_track(problem, model, track).unwrap_or(0),
-        };
-        let calibrated = calibrations.iter().enumerate().map(|(camera, outcome)| {
-            let intrinsics = model.lenses[camera].intrinsics;
-            (Some(intrinsics).filter(|_| grade != Grade::ProjectiveOnly), outcome.clone())
-        });
-        let geometry = Geometry {
-            cameras: model.cameras(problem),
-            lenses: (0..problem.views()).map(|view| model.intrinsics_of(problem, view)).collect(),
-            is_metric: grade != Grade::ProjectiveOnly,
-            component_of_view: model.component_of.clone(),
-            component_of_track: (0..problem.tracks()).map(component).collect(),
-            by_observation: seed.judges_observations(),
-            of_static: model.of_static,
-            noise: model.noise,
-            inlier_share: share(
-                verified(model).len(),
-                problem.verifiable(model.of_static, |view| model.poses[view].is_some()),
-            ),
-        };
-        Self {
-            geometry,
-            poses: (0..problem.views()).map(|view| model.poses[view].filter(|_| is_reported(&view))).collect(),
-            left_out: left_out.clone(),
-            canonical: None,
-            grade,
-            calibrated: calibrated.collect(),
-            warnings: named_warnings(problem, calibrations),
-        }
-    }
-
     /// The same without these views, for these reasons.
     pub fn leave_out(&mut self, views: Vec<(usize, LeftOut)>) {
         for &(view, _) in &views {
@@ -147,7 +109,7 @@ impl Reconstruction {
 }
 
 /// Prior probability that a track is right, of so many that were found to be.
-fn share(right: usize, tried: usize) -> f64 {
+pub(super) fn share(right: usize, tried: usize) -> f64 {
     (right as f64 + 1.0) / (tried.max(right) as f64 + 2.0)
 }
 
@@ -176,7 +138,7 @@ fn mask(problem: &Problem, block_tracks: &[usize], decided: &Decided, judged: &m
 }
 
 /// What is to be said of the calibrations, each group's named where there are several.
-fn named_warnings(problem: &Problem, outcomes: &[Outcome]) -> Vec<Warning> {
+pub(super) fn named_warnings(problem: &Problem, outcomes: &[Outcome]) -> Vec<Warning> {
     let (group_of, groups) = camera_groups(problem.input);
     let id_of = |group: usize| {
         let view = group_of.iter().position(|of| *of == group).filter(|_| outcomes.len() == groups)?;

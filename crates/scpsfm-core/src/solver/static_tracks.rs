@@ -8,8 +8,8 @@
 use nalgebra::Vector2;
 
 use super::block::Block;
-use super::grow::LEAST_INLIERS;
-use super::problem::{Problem, VERIFIED};
+use super::consensus::LEAST_INLIERS;
+use crate::domain::VERIFIED;
 use crate::domain::{Warning, WarningCode};
 
 options! {
@@ -57,21 +57,23 @@ pub fn find(ranges: &[usize], xy: &[Vector2<f64>]) -> Vec<bool> {
 }
 
 /// The block without static tracks; `None` where it has none, or too little beside them.
-pub fn without(problem: &Problem, block: &Block) -> Option<Block> {
-    let moving = moving(problem, block);
+///
+/// * `is_static`: whether each track of the input is
+pub fn without(is_static: &[bool], block: &Block) -> Option<Block> {
+    let moving = moving(is_static, block);
     (moving.len() < block.tracks.len() && moving.len() >= OPTIONS.least_moving).then(|| block.select(&moving))
 }
 
 /// The tracks of a block that are not static, by their place in it.
-pub fn moving(problem: &Problem, block: &Block) -> Vec<usize> {
-    (0..block.tracks.len()).filter(|&k| !problem.is_static[block.tracks[k]]).collect()
+pub fn moving(is_static: &[bool], block: &Block) -> Vec<usize> {
+    (0..block.tracks.len()).filter(|&k| !is_static[block.tracks[k]]).collect()
 }
 
 /// What is said of static tracks that are no part of the scene; `None` of few.
 ///
-/// * `inlier`: whether each track is
-pub fn warning(problem: &Problem, inlier: &[bool]) -> Option<Warning> {
-    let outside = problem.is_static.iter().zip(inlier).filter(|(is_static, inlier)| **is_static && !**inlier).count();
+/// * `inlier`: whether each track is of the scene
+pub fn warning(is_static: &[bool], inlier: &[bool]) -> Option<Warning> {
+    let outside = is_static.iter().zip(inlier).filter(|(is_static, inlier)| **is_static && !**inlier).count();
     let detail = format!(
         "{outside} tracks stay where they are in the image while others move, and the scene holds none of them"
     );

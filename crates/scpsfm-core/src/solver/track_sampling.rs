@@ -5,9 +5,8 @@
 //! fourteen too few to verify anything. The trained network is linear in the tracks: it can be asked about all of them,
 //! and the search looks at those that it ranks first.
 
-use super::Error;
-use super::attempt::Effort;
 use super::block::Block;
+use super::error::Error;
 use super::learned::{self, TrackScoreOptions, TrackScores};
 use super::problem::Problem;
 
@@ -16,18 +15,20 @@ const ASKED_OBSERVATIONS: usize = 50_000;
 
 /// A sample of at most `most` tracks of a block, and what the network says of it, where it was asked.
 ///
+/// * `asks_network`: whether it may be
+///
 /// # Errors
 /// [`Error::Stopped`].
 pub fn sample(
     problem: &Problem,
     block: &Block,
     most: usize,
-    effort: Effort,
+    asks_network: bool,
 ) -> Result<(Block, Option<TrackScores>), Error> {
     let sample = block.clone().sample(most, problem.settings.seed);
     // The windows that seed a sequence share their tracks with others, and depths tell right tracks by themselves.
     let is_all = sample.tracks.len() == block.tracks.len();
-    if is_all || effort.is_seed || block.complete.has_depths() || !learned::may_be_asked(problem.settings) {
+    if is_all || !asks_network || block.complete.has_depths() || !learned::may_be_asked(problem.settings) {
         return Ok((sample, None));
     }
     let Some(track_scores) = TrackScores::of(&sample.complete) else { return Ok((sample, None)) };

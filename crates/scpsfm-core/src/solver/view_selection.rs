@@ -3,16 +3,12 @@
 
 use std::cmp::Reverse;
 
-use super::grow::LEAST_INLIERS;
-use super::problem::{Problem, observed_views};
-use crate::domain::Input;
+use super::consensus::{LEAST_INLIERS, LEAST_VIEWS};
+use super::problem::{Problem, complete_views};
 use crate::geometry::fundamental;
 
 /// Tracks that every two views of a triplet share: one more than determine their fundamental matrix.
 pub const LEAST_SHARED_BY_PAIR: usize = fundamental::LEAST_MATCHES + 1;
-
-/// Views below which a projective reconstruction carries no calibration worth searching for.
-pub const LEAST_VIEWS: usize = 3;
 
 /// Views that a reconstruction begins with.
 #[derive(Debug, Clone)]
@@ -175,15 +171,6 @@ fn shared_tracks(problem: &Problem, open: &[bool], view: usize) -> Vec<usize> {
     shared
 }
 
-/// The views in which anything is observed, if at least half of the tracks that are observed at all, and enough of
-/// them, are seen in all of these. Padding, views and tracks without observations, changes nothing.
-pub fn complete_views(input: &Input, ranges: &[usize]) -> Option<Vec<usize>> {
-    let views = observed_views(input);
-    let observed = ranges.windows(2).filter(|range| range[1] > range[0]).count();
-    let complete = ranges.windows(2).filter(|range| range[1] - range[0] == views.len()).count();
-    (views.len() >= LEAST_VIEWS && complete >= LEAST_INLIERS && 2 * complete >= observed).then_some(views)
-}
-
 /// From every view, adds the view that keeps most tracks complete, as long as `least` remain; of the sizes passed on
 /// the way, keeps the one with most constraints.
 fn greedy_views(problem: &Problem, open: &[bool], least: usize) -> Vec<Vec<usize>> {
@@ -253,6 +240,7 @@ fn diverse<Set: AsRef<[usize]>>(ranked: Vec<Set>, most: usize) -> Vec<Set> {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::domain::Input;
     use crate::domain::{Limits, RawInput, SolveSettings, StopToken, View, WarningCode};
     use crate::parallel::Threads;
 

@@ -16,7 +16,7 @@ pub use options::FalseAlarmOptions;
 
 use nalgebra::Vector2;
 
-use super::grow::{self, Consensus, LEAST_INLIERS, LEAST_SUPPORT};
+use super::consensus::{self, Consensus, LEAST_INLIERS, LEAST_SUPPORT};
 use crate::domain::StopToken;
 use crate::geometry::measurement::CompleteBlock;
 use crate::geometry::statistics::{chi_square_gate, ln_choose};
@@ -96,7 +96,7 @@ impl Consensus {
     /// The same, of so many inliers that differ.
     fn ln_by_residuals(&self, spread: f64, inliers: usize) -> f64 {
         let (views, tracks) = (self.cameras.len(), self.inlier.len());
-        let constraints = grow::constraint_count(views, inliers);
+        let constraints = consensus::constraint_count(views, inliers);
         let Some(rms) = self.rms() else { return f64::INFINITY };
         if constraints <= 0.0 {
             return f64::INFINITY;
@@ -107,7 +107,7 @@ impl Consensus {
     /// Root mean square residual of the inliers, one coordinate; `None` where they leave no constraints.
     fn rms(&self) -> Option<f64> {
         let inliers = self.inliers();
-        let constraints = grow::constraint_count(self.cameras.len(), inliers.len());
+        let constraints = consensus::constraint_count(self.cameras.len(), inliers.len());
         let cost: f64 = inliers.into_iter().map(|track| self.squared[track]).sum();
         (constraints > 0.0).then(|| (cost / constraints).sqrt())
     }
@@ -164,7 +164,7 @@ mod tests {
     use crate::domain::{Input, Limits};
     use crate::geometry::{Camera, Point};
     use crate::solver::search::affine;
-    use crate::solver::{block, portfolio};
+    use crate::solver::{block, grow, spread};
     use crate::synthetic::{Scene, SceneOptions};
 
     /// Those of right tracks and those that random tracks were bent to.
@@ -177,7 +177,7 @@ mod tests {
                 let scene = Scene::generate(&options).expect("valid options");
                 let input = Input::new(scene.input, &Limits::default(), "scene").expect("valid scene");
                 let complete = block::of_all_views(&input).complete;
-                let spread = portfolio::spread(&complete);
+                let spread = spread::spread(&complete);
                 let stop = StopToken::default();
                 for noise in [0.003, 0.02, 0.08] {
                     let Some(start) = affine::seed(&complete, (0..12).collect()) else { continue };
@@ -204,7 +204,7 @@ mod tests {
             })
             .collect();
         let tracks = points.len();
-        let squared = noise * noise * grow::constraint_count(cameras.len(), tracks) / tracks as f64;
+        let squared = noise * noise * consensus::constraint_count(cameras.len(), tracks) / tracks as f64;
         Consensus {
             cameras,
             points,

@@ -9,7 +9,7 @@ use crate::geometry::measurement::CompleteBlock;
 use crate::geometry::observation::Observation;
 use crate::geometry::statistics::chi_square_quantile;
 use crate::geometry::triangulation::batch::{Batch, LANES};
-use crate::solver::grow::{self, Consensus};
+use crate::solver::consensus::{self, Consensus};
 
 /// Where the random numbers begin: one consensus, one answer.
 const SEED: u64 = 0;
@@ -21,7 +21,7 @@ pub fn constraints_of_track(block: &CompleteBlock) -> f64 {
 
 /// Squared residual up to which the cameras of a consensus admit a track.
 pub fn gate(block: &CompleteBlock, consensus: &Consensus) -> f64 {
-    grow::gate(block.views()) * consensus.noise * consensus.noise
+    consensus::gate(block.views()) * consensus.noise * consensus.noise
 }
 
 /// Distribution of the squared residuals of such tracks where few are so small that they could be counted: that of
@@ -84,7 +84,7 @@ impl<'a> RandomTracks<'a> {
             let drawn: Vec<_> = (0..some).map(|_| random_track(block, rng)).collect();
             let drawn: Vec<&[Observation]> = drawn.iter().map(Vec::as_slice).collect();
             let batch = Batch::new(cameras, &drawn);
-            let found = batch.refine(batch.linear(), |_| true, grow::ConsensusOptions::DEFAULT.point_steps);
+            let found = batch.refine(batch.linear(), |_| true, consensus::ConsensusOptions::DEFAULT.point_steps);
             let finite = |cost: f64| if cost.is_finite() { cost } else { f64::MAX };
             squared.extend((0..batch.tracks()).map(|track| finite(found.cost(track))));
         }

@@ -1,7 +1,9 @@
 //! One block of views from search to calibration.
 
+mod densest;
 mod options;
 
+pub use densest::solve_densest;
 pub use options::AttemptOptions;
 
 use super::a_contrario::FalseAlarmOptions;
@@ -9,19 +11,22 @@ use super::baselines::{self, Decided};
 use super::block::Block;
 use super::calibration::{self, Outcome};
 use super::classification::Judged;
+use super::consensus::{Consensus, LEAST_INLIERS, NoiseOptions};
 use super::depths::{self, DepthOptions, TrackWeights};
+use super::error::Error;
 use super::fusion::Estimate;
-use super::grow::{self, Consensus, LEAST_INLIERS};
+use super::grow;
 use super::learned::TrackScores;
-use super::portfolio::{self, Found, Portfolio, VerifiedBy};
+use super::portfolio::{Found, Portfolio, VerifiedBy};
 use super::problem::Problem;
+use super::projective::ProjectiveReconstruction;
 use super::recorder::Recorder;
 use super::search::rigid::{LEAST_TRACKS, Rigid};
-use super::sequence::ProjectiveReconstruction;
-use super::{Error, all_tracks, near_duplicates, scpsfm, static_tracks, track_sampling};
+use super::{all_tracks, near_duplicates, scpsfm, static_tracks, track_sampling};
 use crate::domain::{FocalPrior, Grade, Method, Stage, WarningCode};
 use crate::geometry::bundle::metric::{Intrinsics, MetricReconstruction};
 use crate::geometry::statistics::median;
+use crate::solver::spread;
 
 const OPTIONS: AttemptOptions = AttemptOptions::DEFAULT;
 
@@ -139,10 +144,10 @@ impl Attempt {
     }
 
     /// Whether the residuals are of several kinds, most small and some large: tracks that hold wrong observations were
-    /// fitted at too high a noise. Never up to [`AttemptOptions::initial_noise`], where the gates keep wrong
+    /// fitted at too high a noise. Never up to [`NoiseOptions::initial`], where the gates keep wrong
     /// observations out.
     pub fn has_mixed_residuals(&self) -> bool {
-        let noisy = self.projective.as_ref().filter(|found| found.noise > OPTIONS.initial_noise);
+        let noisy = self.projective.as_ref().filter(|found| found.noise > NoiseOptions::DEFAULT.initial);
         noisy.is_some_and(|found| are_mixed(found.squared_residuals()))
     }
 
@@ -303,16 +308,16 @@ fn searched(problem: &Problem, block: Block, effort: Effort, recorder: &mut Reco
         true => of_many_views,
         false => (OPTIONS.searched_work / block.views.len().max(1).pow(2)).clamp(of_many_views, most),
     };
-    let block = near_duplicates::without(problem, block);
-    if let Some(moving) = static_tracks::without(problem, &block) {
-        let (sample, track_scores) = track_sampling::sample(problem, &moving, most, effort)?;
+    let block = near_duplicates::without(&problem.representative, block);
+    if let Some(moving) = static_tracks::without(&problem.is_static, &block) {
+        let (sample, track_scores) = track_sampling::sample(problem, &moving, most, !effort.is_seed)?;
         let attempt = search(problem, sample, track_scores, effort, recorder)?;
         if attempt.found.consensus.is_some() {
             return Ok(attempt);
         }
         recorder.begin_again();
     }
-    let (sample, track_scores) = track_sampling::sample(problem, &block, most, effort)?;
+    let (sample, track_scores) = track_sampling::sample(problem, &block, most, !effort.is_seed)?;
     search(problem, sample, track_scores, effort, recorder)
 }
 
@@ -338,7 +343,7 @@ fn search(
     if attempt.is_by_depths() {
         return Ok(verified_by_depths(problem, attempt, consensus));
     }
-    let (mut refined, ln_false_alarms) = grow::refine(complete, &consensus, portfolio::spread(complete), problem.stop);
+    let (mut refined, ln_false_alarms) = grow::refine(complete, &consensus, spread::spread(complete), problem.stop);
     recorder.hypothesis.inliers = refined.inlier_count() as u32;
     recorder.hypothesis.best_cost = Some(refined.score);
     recorder.report(1.0);

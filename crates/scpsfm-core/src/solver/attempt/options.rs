@@ -3,8 +3,6 @@
 /// How much of a block is searched and calibrated, and what its residuals say.
 #[derive(Debug, Clone, PartialEq)]
 pub struct AttemptOptions {
-    /// Noise that growing starts from when the caller gives none, as a share of the image side.
-    pub initial_noise: f64,
     /// Tracks that a search looks at, at most and where there are many views.
     pub searched_tracks: (usize, usize),
     /// Tracks times squared views that a search may hold between those two.
@@ -20,8 +18,6 @@ pub struct AttemptOptions {
 
 impl AttemptOptions {
     pub const DEFAULT: Self = Self {
-        // High on purpose: twice too low loses the scene, ten times too high costs nothing.
-        initial_noise: 0.005,
         // Bundle adjustment costs their number times the square of the views, and more tracks make a consensus neither
         // easier to find nor much more exact.
         searched_tracks: (600, 200),

@@ -9,6 +9,7 @@ use super::fit::Fit;
 use super::misfit;
 use super::models::Choice;
 use super::options::{CalibrationOptions, CriticalOptions};
+use crate::domain::VERIFIED;
 use crate::domain::{StopToken, Warning, WarningCode};
 use crate::geometry::bundle::critical::{Homographies, Translating};
 use crate::geometry::bundle::metric::{Extension, IntrinsicsModel, IntrinsicsPrior, MetricReconstruction};
@@ -17,8 +18,7 @@ use crate::geometry::critical::{self, ReferenceHomographies};
 use crate::geometry::homography::{self, LEAST_COMMON};
 use crate::geometry::observation::{Observation, observed_points};
 use crate::geometry::statistics::{CHI_SQUARE_OF_TWO, core_noise};
-use crate::solver::classification::evidence;
-use crate::solver::problem::VERIFIED;
+use crate::solver::noise_model::evidence;
 
 /// What kind of motion and scene the views show.
 pub(super) struct Critical {

@@ -7,9 +7,10 @@ use super::options::CalibrationOptions;
 use super::search::Minimum;
 use super::verdict::Verdict;
 use super::view_focals::{self, Differing};
-use super::{Error, Outcome, Stretch, Uncalibrated};
+use super::{Outcome, Stretch, Uncalibrated};
 use crate::domain::{FocalPrior, Grade, Warning, WarningCode};
 use crate::geometry::bundle::metric::{Extension, IntrinsicsModel, IntrinsicsPrior, Parameter};
+use crate::solver::error::Error;
 
 /// Chooses among the minima and models, and says what the choice is worth for each camera group.
 ///

@@ -27,7 +27,7 @@ use crate::geometry::daq::to_canonical_frame;
 use crate::geometry::observation::{self, Observation};
 use crate::geometry::planar;
 
-use super::Error;
+use super::error::Error;
 use critical::Upgrade;
 use fit::Fit;
 pub use options::{CalibrationOptions, FitOptions, GradeOptions};

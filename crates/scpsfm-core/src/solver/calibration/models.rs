@@ -1,13 +1,14 @@
 //! Which intrinsics the data carry.
 
+use super::Uncalibrated;
 use super::fit::Fit;
 use super::options::{CalibrationOptions, GradeOptions};
 use super::search::{Minimum, Search};
-use super::{Error, Uncalibrated};
 use crate::domain::{FocalPrior, StopToken, Warning, WarningCode};
 use crate::geometry::bundle::metric::{
     Extension, Information, Intrinsics, IntrinsicsModel, IntrinsicsPrior, MetricReconstruction, Optimum, Parameter,
 };
+use crate::solver::error::Error;
 
 /// A metric reconstruction under one model, with what the observations say of the intrinsics there.
 pub(super) struct Candidate {

@@ -7,7 +7,7 @@ use crate::domain::{FocalPrior, Grade, Warning, WarningCode};
 use crate::geometry::bundle;
 use crate::geometry::bundle::metric::{Extension, IntrinsicsModel, IntrinsicsPrior, Parameter};
 use crate::geometry::statistics::{CHI_SQUARE_OF_ONE, CHI_SQUARE_OF_TWO, GATE_QUANTILE, chi_square_quantile};
-use crate::solver::grow::LEAST_INLIERS;
+use crate::solver::consensus::LEAST_INLIERS;
 
 options! {
     /// Thresholds of a calibration, by stage.

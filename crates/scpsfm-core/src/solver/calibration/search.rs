@@ -2,9 +2,9 @@
 
 use nalgebra::Vector2;
 
+use super::Uncalibrated;
 use super::fit::Fit;
 use super::options::{CalibrationOptions, SearchOptions};
-use super::{Error, Uncalibrated};
 use crate::domain::StopToken;
 use crate::geometry::bundle::critical::Translating;
 use crate::geometry::bundle::metric::{
@@ -15,6 +15,7 @@ use crate::geometry::daq::{self, CanonicalFrame, Daq, Free};
 use crate::geometry::metric::{cheirality, retriangulate, upgrade, upgrade_translation};
 use crate::geometry::observation::Observation;
 use crate::geometry::statistics::{median, root_mean_square};
+use crate::solver::error::Error;
 
 /// A converged metric reconstruction.
 #[derive(Debug, Clone)]

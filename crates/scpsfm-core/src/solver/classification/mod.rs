@@ -4,11 +4,9 @@
 //! in the image. A track is judged by what it retains once observations that are more likely wrong than right are
 //! dropped, at a price for each.
 
-mod noise;
 mod options;
 mod track_classifier;
 
-pub use noise::{NoiseModel, evidence, outlier_density, working_gate};
 pub use options::ClassificationOptions;
 
 use std::ops::Range;
@@ -20,9 +18,10 @@ use crate::geometry::observation::Observation;
 use crate::geometry::robust_triangulation::{self, Triangulator};
 use crate::geometry::triangulation::batch::LANES;
 use crate::geometry::{Camera, Point};
+use crate::solver::consensus::LEAST_VIEWS;
+use crate::solver::noise_model::NoiseModel;
 use crate::solver::per_track::{BATCH, TRACKS_A_RUN, WORTH_A_THREAD};
 use crate::solver::problem::{LEAST_RETAINED_SHARE, Problem};
-use crate::solver::view_selection::LEAST_VIEWS;
 use track_classifier::{Finding, TrackClassifier};
 
 const OPTIONS: ClassificationOptions = ClassificationOptions::DEFAULT;

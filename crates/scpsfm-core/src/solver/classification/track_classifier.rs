@@ -2,12 +2,14 @@
 
 use std::ops::Range;
 
-use super::{Geometry, Judged, NoiseModel, OPTIONS, SplitPoint, TwoViewPoint};
+use super::{Geometry, Judged, OPTIONS, SplitPoint, TwoViewPoint};
+use crate::domain::VERIFIED;
 use crate::geometry::observation::Observation;
 use crate::geometry::robust_triangulation::{Triangulator, squared_in_front};
 use crate::geometry::triangulation::batch::{Batch, LANES};
 use crate::geometry::{Camera, Point, triangulation};
-use crate::solver::problem::{Problem, VERIFIED};
+use crate::solver::noise_model::NoiseModel;
+use crate::solver::problem::Problem;
 
 /// The verdict on one track.
 #[derive(Debug, Clone)]

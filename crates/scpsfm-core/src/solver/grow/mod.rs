@@ -9,86 +9,17 @@ mod noise;
 mod options;
 
 pub use noise::{estimate_noise, refine};
-pub use options::{ConsensusOptions, NoiseOptions};
+use options::GrowingOptions;
 
+use super::consensus::{Consensus, ConsensusOptions, LEAST_SUPPORT, gate, judge, observations_of};
 use super::search::Seed;
 use crate::domain::StopToken;
 use crate::geometry::bundle::{self, Loss, projective};
 use crate::geometry::measurement::CompleteBlock;
-use crate::geometry::observation::Observation;
-use crate::geometry::statistics::chi_square_gate;
-use crate::geometry::triangulation::batch::{Batch, LANES};
 use crate::geometry::{Camera, Point};
 
-const OPTIONS: ConsensusOptions = ConsensusOptions::DEFAULT;
-/// Tracks below which projective cameras of three views or more are not determined by image points:
-/// `2nk > 11n + 3k - 15`.
-pub const LEAST_SUPPORT: usize = 7;
-/// Inliers that geometry can verify: one track more than determine the cameras.
-pub const LEAST_INLIERS: usize = LEAST_SUPPORT + 1;
-
-/// Cameras, and every track of the block judged by them.
-#[derive(Debug, Clone)]
-pub struct Consensus {
-    pub cameras: Vec<Camera>,
-    /// Triangulated point of every track.
-    pub points: Vec<Point>,
-    /// Sum of squared reprojection residuals of every track, normalised units.
-    pub squared: Vec<f64>,
-    pub inlier: Vec<bool>,
-    /// Noise that the gate assumes: one standard deviation of a coordinate, normalised units.
-    pub noise: f64,
-    /// Truncated cost as a share of the cost of calling every track an outlier, 0 to 1.
-    pub score: f64,
-}
-
-impl Consensus {
-    /// The inlier tracks, increasing.
-    pub fn inliers(&self) -> Vec<usize> {
-        (0..self.inlier.len()).filter(|&track| self.inlier[track]).collect()
-    }
-
-    pub fn inlier_count(&self) -> usize {
-        self.inlier.iter().filter(|&&inlier| inlier).count()
-    }
-}
-
-/// Constraints that `tracks` complete tracks in `views` views leave to a projective reconstruction.
-pub fn constraint_count(views: usize, tracks: usize) -> f64 {
-    (2 * views * tracks) as f64 - (11 * views + 3 * tracks) as f64 + 15.0
-}
-
-/// Squared-residual gate of a complete track in units of the variance.
-pub fn gate(views: usize) -> f64 {
-    chi_square_gate((2 * views) as f64 - 3.0)
-}
-
-/// Judges every track of a block by cameras.
-///
-/// Once `stop` fires the remaining tracks are outliers: nobody will look at the result.
-pub fn judge(block: &CompleteBlock, cameras: Vec<Camera>, noise: f64, stop: &StopToken) -> Consensus {
-    let gate = gate(block.views()) * noise * noise;
-    let mut points = Vec::with_capacity(block.tracks());
-    let mut squared = Vec::with_capacity(block.tracks());
-    for first in (0..block.tracks()).step_by(LANES) {
-        if stop.is_stopped() {
-            points.resize(block.tracks(), Point::new(0.0, 0.0, 0.0, 1.0));
-            squared.resize(block.tracks(), f64::MAX);
-            break;
-        }
-        let tracks: Vec<_> = (first..block.tracks().min(first + LANES)).map(|track| block.track(track)).collect();
-        let batch = Batch::new(&cameras, &tracks);
-        let start = batch.linear();
-        let found = batch.refine(start, |track| start.cost(track) < OPTIONS.hopeless_gates * gate, OPTIONS.point_steps);
-        points.extend((0..batch.tracks()).map(|track| found.point(track)));
-        let finite = |cost: f64| if cost.is_finite() { cost } else { f64::MAX };
-        squared.extend((0..batch.tracks()).map(|track| finite(found.cost(track))));
-    }
-    let inlier: Vec<bool> = squared.iter().map(|&cost| cost < gate).collect();
-    let score = squared.iter().map(|&cost| (cost / gate).min(1.0)).sum::<f64>() / block.tracks().max(1) as f64;
-    Consensus { cameras, points, squared, inlier, noise, score }
-}
-
+const OPTIONS: GrowingOptions = GrowingOptions::DEFAULT;
+const CONSENSUS: ConsensusOptions = ConsensusOptions::DEFAULT;
 /// Fits at one noise level, and where those ended that converged: the same support under the same loss ends there
 /// again, so that it is looked up instead.
 ///
@@ -155,7 +86,7 @@ impl<'a> Fits<'a> {
         let mut best: Option<Consensus> = None;
         let mut idle = 0;
         for round in 0..OPTIONS.rounds {
-            let loss = if support.len() > OPTIONS.plain_support { OPTIONS.loss(self.noise) } else { Loss::Squared };
+            let loss = if support.len() > OPTIONS.plain_support { CONSENSUS.loss(self.noise) } else { Loss::Squared };
             let iterations =
                 if round < OPTIONS.first_rounds { OPTIONS.first_iterations } else { OPTIONS.later_iterations };
             let (judged, converged) = self.fit(&cameras, points, &support, loss, iterations);
@@ -193,7 +124,7 @@ impl<'a> Fits<'a> {
                 if support.len() < LEAST_SUPPORT || too_many || self.stop.is_stopped() {
                     continue;
                 }
-                let loss = if inflation > 1.0 { OPTIONS.loss(noise) } else { Loss::Squared };
+                let loss = if inflation > 1.0 { CONSENSUS.loss(noise) } else { Loss::Squared };
                 current = self.refit(&current, &support, loss, OPTIONS.later_iterations);
                 if current.score < best.score {
                     best = current.clone();
@@ -210,15 +141,6 @@ impl<'a> Fits<'a> {
         }
         best
     }
-}
-
-/// The observations of some tracks; point `k` is `support[k]`.
-pub fn observations_of(block: &CompleteBlock, support: &[usize]) -> Vec<Observation> {
-    support
-        .iter()
-        .enumerate()
-        .flat_map(|(point, &track)| block.track(track).iter().map(move |seen| Observation { point, ..*seen }))
-        .collect()
 }
 
 /// Grows a seed to a consensus and polishes it.

@@ -1,11 +1,12 @@
 //! The noise of a consensus, estimated by its residuals, and the consensus refitted at it.
 
-use super::options::{ConsensusOptions, NoiseOptions};
-use super::{Consensus, Fits, LEAST_INLIERS, constraint_count, judge};
+use super::Fits;
+use super::options::GrowingOptions;
 use crate::domain::StopToken;
 use crate::geometry::measurement::CompleteBlock;
 use crate::geometry::statistics::{chi_square_median, median};
 use crate::solver::a_contrario;
+use crate::solver::consensus::{Consensus, ConsensusOptions, LEAST_INLIERS, NoiseOptions, constraint_count, judge};
 
 const OPTIONS: NoiseOptions = NoiseOptions::DEFAULT;
 
@@ -28,7 +29,7 @@ fn settle_noise(block: &CompleteBlock, consensus: Consensus, stop: &StopToken) -
             &current,
             &inliers,
             ConsensusOptions::DEFAULT.loss(noise),
-            ConsensusOptions::DEFAULT.first_iterations,
+            GrowingOptions::DEFAULT.first_iterations,
         );
         let refitted = fits.polish(fitted);
         // A noise level at which the consensus falls apart was estimated from a fit too flexible to trust.

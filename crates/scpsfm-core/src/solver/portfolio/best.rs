@@ -3,7 +3,7 @@
 use super::OPTIONS;
 use crate::domain::Proposal;
 use crate::solver::a_contrario::FalseAlarmOptions;
-use crate::solver::grow::{Consensus, LEAST_INLIERS};
+use crate::solver::consensus::{Consensus, LEAST_INLIERS};
 
 const VERIFICATION: FalseAlarmOptions = FalseAlarmOptions::DEFAULT;
 
@@ -58,8 +58,7 @@ impl Best {
 
     /// Whether it displaces another: clearly less likely to be chance, the proposal that came first wins. Of different
     /// evidence, what image points alone verify beyond doubt is better: it holds whatever the depths are worth. An
-    /// extension, which is not tested against chance, is not, see
-    /// [`Attempt::outweighs`](crate::solver::attempt::Attempt::outweighs).
+    /// extension, which is not tested against chance, is not (`Attempt::outweighs`).
     ///
     /// Costs would not do to compare by: they depend on the noise that each was grown at.
     pub fn displaces(&self, other: &Self) -> bool {

@@ -9,15 +9,15 @@
 mod best;
 mod options;
 mod proposals;
-mod spread;
 mod stats;
 
+use crate::solver::spread;
 use std::time::Instant;
 
 use rand::SeedableRng;
 use rand_chacha::ChaCha8Rng;
 
-use super::grow::{Consensus, LEAST_INLIERS};
+use super::consensus::{Consensus, LEAST_INLIERS};
 use super::learned::{self, TrackScores};
 use super::recorder::Recorder;
 use super::scpsfm::{HeadOptions, HeadSearch};
@@ -30,7 +30,6 @@ use crate::network::NetworkSettings;
 use best::Best;
 pub use best::VerifiedBy;
 use options::PortfolioOptions;
-pub use spread::{MOST_SPREAD, spread, spread_of};
 use stats::ProposalStats;
 
 const OPTIONS: PortfolioOptions = PortfolioOptions::DEFAULT;
@@ -101,7 +100,7 @@ impl<'a> Portfolio<'a> {
             search,
             assumed_noise: noise,
             noise,
-            spread: spread(block),
+            spread: spread::spread(block),
             rng: ChaCha8Rng::seed_from_u64(settings.seed),
             stats: Proposal::ALL.into_iter().map(ProposalStats::new).collect(),
             best: None,

@@ -8,17 +8,19 @@ use std::cmp::Reverse;
 
 pub use motion::describe;
 
-use super::Error;
 use super::block::Block;
 use super::calibration::FitOptions;
 use super::classification::{Geometry, Judged};
-use super::grow::{self, LEAST_INLIERS, LEAST_SUPPORT};
+use super::consensus::{self, LEAST_INLIERS, LEAST_SUPPORT};
+use super::error::Error;
 use super::priors;
-use super::problem::{Problem, Undone, VERIFIED};
+use super::problem::{Problem, Undone};
+use super::projective::ProjectiveReconstruction;
 use super::recorder::Recorder;
 use super::search::affine::AffineSearch;
-use super::sequence::{self, Ended, ExtensionOptions, ProjectiveReconstruction};
+use super::sequence::{self, Ended, ExtensionOptions};
 use super::view_selection::ViewSelectionOptions;
+use crate::domain::VERIFIED;
 use crate::domain::second_structure::{SecondStructure, SecondStructureKind};
 use crate::domain::{Method, Silent, SolveSettings, StopToken, Warning, WarningCode};
 
@@ -312,7 +314,7 @@ fn far_from(problem: &Problem, geometry: &Geometry, judged: &Judged) -> Vec<bool
     };
     let is_far = |track: usize| {
         let seen = geometry.of_track(problem, track);
-        let gate = OPTIONS.far_gates * grow::gate(seen.len()) * geometry.noise.powi(2);
+        let gate = OPTIONS.far_gates * consensus::gate(seen.len()) * geometry.noise.powi(2);
         seen.len() >= VERIFIED && seen.iter().map(|&k| squared(k)).sum::<f64>() > gate
     };
     let is_asked = |track: usize| {
@@ -368,15 +370,15 @@ mod tests {
                     let count = priors::agreeing(&ranking.expect("finite points"));
                     let held = priors::affine_irls(
                         AffineSearch::new(&rest).centred(),
-                        grow::LEAST_SUPPORT,
+                        consensus::LEAST_SUPPORT,
                         &StopToken::default(),
                     );
-                    assert_eq!(held.is_some(), count >= grow::LEAST_SUPPORT, "{kind}, seed {seed}: {count}");
+                    assert_eq!(held.is_some(), count >= consensus::LEAST_SUPPORT, "{kind}, seed {seed}: {count}");
                     count
                 };
                 let (chance, moved) = (count(0.0), count(0.3));
                 assert!(chance <= 4, "{kind}, seed {seed}: {chance} agree by chance");
-                assert!(moved >= 2 * grow::LEAST_SUPPORT, "{kind}, seed {seed}: {moved} of a second motion agree");
+                assert!(moved >= 2 * consensus::LEAST_SUPPORT, "{kind}, seed {seed}: {moved} of a second motion agree");
             }
         }
     }

@@ -13,14 +13,16 @@ use crate::geometry::bundle::{Loss, Options};
 use crate::geometry::metric::{cheirality, upgrade_calibrated};
 use crate::geometry::observation::Observation;
 use crate::geometry::statistics::{CHI_SQUARE_OF_TWO, median};
-use crate::solver::Error;
 use crate::solver::calibration::CalibrationOptions;
 use crate::solver::classification::Geometry;
-use crate::solver::grow::LEAST_INLIERS;
+use crate::solver::consensus::LEAST_INLIERS;
+use crate::solver::consensus::LEAST_VIEWS;
+use crate::solver::error::Error;
 use crate::solver::problem::Problem;
+use crate::solver::projective::ProjectiveReconstruction;
 use crate::solver::reconstruction::Reconstruction;
-use crate::solver::sequence::{GrowthOptions, ProjectiveReconstruction, widest_angle};
-use crate::solver::view_selection::{LEAST_VIEWS, evenly};
+use crate::solver::sequence::{GrowthOptions, widest_angle};
+use crate::solver::view_selection::evenly;
 
 /// Views that must see a point for it to be reported, as of a point of the scene.
 const LEAST_OBSERVATIONS: usize = 2;

@@ -1,19 +1,21 @@
 //! What the whole sequence says of the calibration of each camera.
 
+use crate::solver::consensus;
 use nalgebra::Vector3;
 
 use super::adjust::{self, Extract};
 use super::model::Model;
 use super::options::StretchOptions;
 use super::{own_focals, structure, windows};
+use crate::domain::VERIFIED;
 use crate::domain::{FocalPrior, Grade, Task, Warning, WarningCode};
 use crate::geometry::bundle::metric::{Intrinsics, MetricReconstruction};
 use crate::geometry::observation::Observation;
 use crate::geometry::{Camera, Point};
 use crate::solver::calibration::{self, Outcome, Uncalibrated};
-use crate::solver::problem::{Problem, VERIFIED};
+use crate::solver::error::Error;
+use crate::solver::problem::Problem;
 use crate::solver::recorder::Recorder;
-use crate::solver::{Error, view_selection};
 
 const OPTIONS: StretchOptions = StretchOptions::DEFAULT;
 /// How far off their common centre cameras begin, and how near points at infinity do: their product moves an image by a
@@ -89,14 +91,14 @@ fn calibrate_registered(
         views.is_empty() || stretch.as_ref().is_none_or(|stretch| of_stretch(stretch) >= OPTIONS.least_of_camera)
     };
     let mut found = Vec::new();
-    if registered.len() >= view_selection::LEAST_VIEWS && of_camera.iter().all(holds_enough) {
+    if registered.len() >= consensus::LEAST_VIEWS && of_camera.iter().all(holds_enough) {
         recorder.step(Task::Cameras, pass + 1, pass + 1, 0.0);
         found.push(of_run(problem, model, &registered, stretch.as_deref(), recorder)?);
     }
     let mut graded = found.iter().flat_map(|(_, outcomes)| outcomes);
     if is_long && problem.cameras > 1 && graded.all(|(_, outcome)| outcome.grade == Grade::ProjectiveOnly) {
         found.clear();
-        let runs = of_camera.iter().filter(|views| views.len() >= view_selection::LEAST_VIEWS);
+        let runs = of_camera.iter().filter(|views| views.len() >= consensus::LEAST_VIEWS);
         for (k, views) in runs.enumerate() {
             recorder.step(Task::Cameras, pass * problem.cameras + k + 1, (pass + 1) * problem.cameras, 0.0);
             let stretch = (views.len() > OPTIONS.most_views).then(|| densest(problem, model, views));
@@ -136,7 +138,7 @@ pub fn report_found(problem: &Problem, model: &Model, recorder: &mut Recorder) {
 
 /// What is said of a camera of which fewer views are registered than a calibration needs.
 pub fn too_few(views: usize) -> Outcome {
-    let detail = format!("only {views} views are registered; a calibration needs {}", view_selection::LEAST_VIEWS);
+    let detail = format!("only {views} views are registered; a calibration needs {}", consensus::LEAST_VIEWS);
     Outcome::refused(vec![Warning::new(WarningCode::UnobservableFocal, detail)])
 }
 

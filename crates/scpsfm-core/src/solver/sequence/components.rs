@@ -10,10 +10,12 @@ use crate::domain::{FocalPrior, Grade};
 use crate::geometry::bundle::metric::Intrinsics;
 use crate::solver::attempt::{self, Attempt, Effort};
 use crate::solver::calibration::Outcome;
+use crate::solver::consensus;
+use crate::solver::error::Error;
 use crate::solver::problem::Problem;
 use crate::solver::recorder::Recorder;
+use crate::solver::view_selection;
 use crate::solver::view_selection::SeedViews;
-use crate::solver::{Error, view_selection};
 
 const OPTIONS: ComponentOptions = ComponentOptions::DEFAULT;
 /// How the block of a further component is searched.
@@ -159,7 +161,7 @@ enum SeedKind {
 /// The best seed of this kind among open views.
 fn next_seed(problem: &Problem, open: &[bool], kind: SeedKind) -> Option<SeedViews> {
     let is_worth = |open: &[bool]| {
-        open.iter().filter(|open| **open).count() >= view_selection::LEAST_VIEWS && !problem.stop.is_stopped()
+        open.iter().filter(|open| **open).count() >= consensus::LEAST_VIEWS && !problem.stop.is_stopped()
     };
     let block_among = |open: &[bool]| {
         let found = || view_selection::candidate_views_among(problem, open).into_iter().next();
@@ -210,7 +212,7 @@ pub fn drop_unsupported(
     };
     let views = model.of_component(component);
     let mut dropped: Vec<usize> = views.iter().copied().filter(unsupported).collect();
-    if views.len() - dropped.len() < view_selection::LEAST_VIEWS {
+    if views.len() - dropped.len() < consensus::LEAST_VIEWS {
         dropped.clone_from(&views);
     }
     model.unregister(problem, &dropped);

@@ -6,13 +6,15 @@ use super::register;
 use super::{adjust, calibrate, components, growth, structure};
 use crate::domain::{Grade, LeftOut, Stage, Task, Warning, WarningCode};
 use crate::geometry::bundle::metric::MetricReconstruction;
-use crate::solver::attempt::{Attempt, AttemptOptions};
+use crate::solver::attempt::Attempt;
 use crate::solver::calibration::Outcome;
-use crate::solver::classification::evidence;
-use crate::solver::grow::LEAST_INLIERS;
+use crate::solver::classification::Geometry;
+use crate::solver::consensus::{LEAST_INLIERS, LEAST_VIEWS, NoiseOptions};
+use crate::solver::error::Error;
+use crate::solver::noise_model::evidence;
 use crate::solver::problem::Problem;
+use crate::solver::reconstruction::{Reconstruction, named_warnings, share};
 use crate::solver::recorder::Recorder;
-use crate::solver::{Error, view_selection};
 
 const OPTIONS: ExtensionOptions = ExtensionOptions::DEFAULT;
 
@@ -85,7 +87,7 @@ impl Extended {
             let grades = self.calibrations.iter().zip(&views).filter(|(_, views)| **views >= least);
             grades.map(|(outcome, _)| outcome.grade).reduce(Grade::worse)
         };
-        worst(view_selection::LEAST_VIEWS).or_else(|| worst(1)).unwrap_or(Grade::ProjectiveOnly)
+        worst(LEAST_VIEWS).or_else(|| worst(1)).unwrap_or(Grade::ProjectiveOnly)
     }
 
     pub fn is_calibrated(&self, problem: &Problem) -> bool {
@@ -121,7 +123,7 @@ impl Extended {
 
     /// Whether there is anything that geometry verifies: views that points hold, and enough points.
     pub fn stands(&self) -> bool {
-        self.model.registered().len() >= view_selection::LEAST_VIEWS
+        self.model.registered().len() >= LEAST_VIEWS
             && adjust::verified(&self.model).len() >= LEAST_INLIERS
             && self.calibrations.iter().any(|outcome| outcome.metric.is_some())
     }
@@ -129,7 +131,7 @@ impl Extended {
     /// Whether nothing is to be gained by extending without a calibration: most views hold together so precisely that
     /// wrong observations do not, and fit as well as projective cameras or are METRIC.
     pub fn is_settled(&self, problem: &Problem) -> bool {
-        let is_precise = self.model.noise <= AttemptOptions::DEFAULT.initial_noise;
+        let is_precise = self.model.noise <= NoiseOptions::DEFAULT.initial;
         // Windows that differ a little warn of a mismatch of a METRIC one too.
         is_precise && self.holds_most_views() && (self.fits() || self.grade(problem) == Grade::Metric)
     }
@@ -137,5 +139,43 @@ impl Extended {
     pub fn holds_most_views(&self) -> bool {
         let registered = self.model.registered().len();
         registered as f64 >= OPTIONS.enough_registered * (registered + self.left_out.len()) as f64
+    }
+
+    /// In terms of the input's views and tracks.
+    pub fn reconstruction(&self, problem: &Problem) -> Reconstruction {
+        let Self { seed, model, calibrations, left_out } = self;
+        let grade = self.grade(problem);
+        let is_reported = |view: &usize| grade != Grade::ProjectiveOnly && model.is_determined(*view);
+        let component = |track: usize| match &model.landmarks[problem.representative[track]] {
+            Some(landmark) => landmark.component,
+            None => structure::component_of_track(problem, model, track).unwrap_or(0),
+        };
+        let calibrated = calibrations.iter().enumerate().map(|(camera, outcome)| {
+            let intrinsics = model.lenses[camera].intrinsics;
+            (Some(intrinsics).filter(|_| grade != Grade::ProjectiveOnly), outcome.clone())
+        });
+        let geometry = Geometry {
+            cameras: model.cameras(problem),
+            lenses: (0..problem.views()).map(|view| model.intrinsics_of(problem, view)).collect(),
+            is_metric: grade != Grade::ProjectiveOnly,
+            component_of_view: model.component_of.clone(),
+            component_of_track: (0..problem.tracks()).map(component).collect(),
+            by_observation: seed.judges_observations(),
+            of_static: model.of_static,
+            noise: model.noise,
+            inlier_share: share(
+                adjust::verified(model).len(),
+                problem.verifiable(model.of_static, |view| model.poses[view].is_some()),
+            ),
+        };
+        Reconstruction {
+            geometry,
+            poses: (0..problem.views()).map(|view| model.poses[view].filter(|_| is_reported(&view))).collect(),
+            left_out: left_out.clone(),
+            canonical: None,
+            grade,
+            calibrated: calibrated.collect(),
+            warnings: named_warnings(problem, calibrations),
+        }
     }
 }

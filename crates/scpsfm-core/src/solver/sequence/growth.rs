@@ -4,7 +4,7 @@
 use std::cmp::Reverse;
 
 use super::options::GrowthOptions;
-use crate::solver::Error;
+use crate::solver::error::Error;
 use crate::solver::problem::Problem;
 use crate::solver::recorder::Recorder;
 

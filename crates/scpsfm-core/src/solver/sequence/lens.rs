@@ -6,17 +6,19 @@
 //! turning camera looks like a scene with depth. Where that calibrates a part of the scene, the input is searched once
 //! more, behind the lenses that were calibrated.
 
+use crate::solver::noise_model;
 use std::f64::consts::SQRT_2;
 
-use super::projective::ProjectiveReconstruction;
 use super::{Ended, Extended, QUICK_SEED, QuickPass};
 use crate::domain::Grade;
 use crate::geometry::bundle::metric::Intrinsics;
 use crate::geometry::homography;
 use crate::solver::calibration::Outcome;
+use crate::solver::error::Error;
 use crate::solver::problem::{Problem, Undone};
+use crate::solver::projective::ProjectiveReconstruction;
 use crate::solver::recorder::Recorder;
-use crate::solver::{Error, attempt, classification, view_selection};
+use crate::solver::{attempt, view_selection};
 
 options! {
     /// Which lenses are sampled, and when one is searched behind.
@@ -197,5 +199,5 @@ fn by_homographies(problem: &Problem, found: &ProjectiveReconstruction) -> Optio
     // Of two views.
     let noise = residual * found.noise / SQRT_2 * ln_scale.exp();
     let unknowns = HOMOGRAPHY_UNKNOWNS * (views - 1) + 2 * found.points.len();
-    Some(classification::evidence(observations.len(), unknowns, noise, problem.outlier_density))
+    Some(noise_model::evidence(observations.len(), unknowns, noise, problem.outlier_density))
 }

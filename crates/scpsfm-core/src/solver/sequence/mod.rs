@@ -21,7 +21,6 @@ mod merging;
 mod model;
 mod options;
 mod own_focals;
-mod projective;
 mod projective_growth;
 mod register;
 mod structure;
@@ -30,21 +29,21 @@ mod windows;
 
 use std::ops::ControlFlow;
 
-pub use adjust::verified;
 pub use extended::Extended;
 pub use options::{ExtensionOptions, GrowthOptions};
-pub use projective::ProjectiveReconstruction;
-pub use structure::{component_of_track, widest_angle};
+pub use structure::widest_angle;
 
 use super::attempt::{self, Attempt, Effort};
 use super::block::Block;
-use super::grow::LEAST_INLIERS;
+use super::consensus::{self, LEAST_INLIERS};
+use super::error::Error;
 use super::learned::TrackScoreOptions;
 use super::problem::Problem;
+use super::projective::ProjectiveReconstruction;
 use super::reconstruction::Reconstruction;
 use super::recorder::Recorder;
 use super::view_selection::{SeedViews, ViewSelectionOptions};
-use super::{Error, near_duplicates, view_selection};
+use super::{near_duplicates, view_selection};
 use crate::domain::Stage;
 use extended::extend;
 
@@ -181,7 +180,8 @@ pub fn reconstruct_quickly(
     recorder: &mut Recorder,
 ) -> Result<Option<ProjectiveReconstruction>, Error> {
     let Blocks { sets, is_whole } = Blocks::of(problem);
-    let blocks: Vec<Block> = sets.iter().map(|views| near_duplicates::without(problem, problem.block(views))).collect();
+    let blocks: Vec<Block> =
+        sets.iter().map(|views| near_duplicates::without(&problem.representative, problem.block(views))).collect();
     let are_sparse = blocks.iter().all(|block| block.tracks.len() < ViewSelectionOptions::DEFAULT.wanted_tracks);
     for block in blocks.into_iter().filter(is_promising) {
         problem.stopped()?;
@@ -243,7 +243,7 @@ impl Ended {
             && lens::explains_enough(self.evidence(problem), of_pinholes.evidence(problem))
     }
 
-    /// How well the observations fit, see [`evidence`](super::classification::evidence).
+    /// How well the observations fit, see [`evidence`](super::noise_model::evidence).
     pub fn evidence(&self, problem: &Problem) -> f64 {
         match self {
             Ended::Extended(extended) => extended.evidence(problem),
@@ -520,7 +520,7 @@ fn extend_projectively(
         options = GrowthOptions { gives_points: false, adjust_growth: f64::INFINITY, final_rounds: 1, ..options };
     }
     let extended = projective_growth::extend(problem, start, &options, recorder)?;
-    let is_enough = extended.views.len() >= view_selection::LEAST_VIEWS && extended.tracks.len() >= least;
+    let is_enough = extended.views.len() >= consensus::LEAST_VIEWS && extended.tracks.len() >= least;
     attempt.projective = before;
     if is_enough && !attempt.outweighs(&extended.views, extended.noise) {
         attempt.projective = Some(extended);

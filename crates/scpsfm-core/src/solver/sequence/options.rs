@@ -1,10 +1,11 @@
 //! The thresholds of growing, adjusting and calibrating a sequence, with their reasons.
 
+use crate::solver::consensus;
 use std::ops::RangeInclusive;
 
 use crate::geometry::bundle::{Loss, Options};
 use crate::geometry::statistics::CHI_SQUARE_OF_TWO;
-use crate::solver::view_selection::{self, ViewSelectionOptions};
+use crate::solver::view_selection::ViewSelectionOptions;
 
 options! {
     /// How views are added; the values are those of metric cameras.
@@ -162,7 +163,7 @@ options! {
         /// Views of each camera that this stretch must hold for all cameras to be calibrated together: as many as one
         /// needs by itself. In 16 sequences of two cameras and 42 to 58 views, sigma fell to half in the median, to a
         /// sixth at best, and rose by a ninth at worst.
-        least_of_camera: usize = view_selection::LEAST_VIEWS,
+        least_of_camera: usize = consensus::LEAST_VIEWS,
         /// Observations that a calibration is made from, and of one view at least and at most. Other errors than noise
         /// bound what more of them would give.
         observations: usize = 6_000,

@@ -11,9 +11,10 @@ use super::{structure, windows};
 use crate::domain::{Grade, Task, Warning, WarningCode};
 use crate::geometry::statistics::root_mean_square;
 use crate::solver::calibration::Outcome;
+use crate::solver::consensus;
+use crate::solver::error::Error;
 use crate::solver::problem::Problem;
 use crate::solver::recorder::Recorder;
-use crate::solver::{Error, view_selection};
 
 /// The one camera that there is where views have focal lengths of their own.
 const CAMERA: usize = 0;
@@ -63,10 +64,7 @@ fn runs(model: &Model) -> Vec<Vec<usize>> {
         let count = views.len().div_ceil(StretchOptions::DEFAULT.most_views);
         (0..count).map(move |k| views[k * views.len() / count..(k + 1) * views.len() / count].to_vec())
     };
-    (0..=components)
-        .flat_map(of_component)
-        .filter(|run: &Vec<usize>| run.len() >= view_selection::LEAST_VIEWS)
-        .collect()
+    (0..=components).flat_map(of_component).filter(|run: &Vec<usize>| run.len() >= consensus::LEAST_VIEWS).collect()
 }
 
 /// One calibration of those of the runs, which are not none: as good as the worst that is not refused, with a sigma

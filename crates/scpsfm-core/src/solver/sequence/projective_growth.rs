@@ -10,16 +10,17 @@ use rand_chacha::ChaCha8Rng;
 
 use super::growth::{self, Growth, Trial};
 use super::options::GrowthOptions;
-use super::projective::ProjectiveReconstruction;
+use crate::domain::VERIFIED;
 use crate::geometry::bundle;
 use crate::geometry::observation::Observation;
 use crate::geometry::robust_triangulation::{self, RobustPoint, Triangulator};
 use crate::geometry::statistics::core_noise;
 use crate::geometry::{Camera, Point, resection};
-use crate::solver::Error;
-use crate::solver::grow::NoiseOptions;
+use crate::solver::consensus::NoiseOptions;
+use crate::solver::error::Error;
 use crate::solver::per_track::each_track;
-use crate::solver::problem::{Problem, VERIFIED};
+use crate::solver::problem::Problem;
+use crate::solver::projective::ProjectiveReconstruction;
 use crate::solver::recorder::Recorder;
 
 /// A reconstruction while it grows, indexed as the input is.

@@ -11,7 +11,7 @@ use super::structure;
 use crate::domain::LeftOut;
 use crate::geometry::bundle::metric::{Intrinsics, Pose};
 use crate::geometry::pose::{self, Correspondences};
-use crate::solver::Error;
+use crate::solver::error::Error;
 use crate::solver::problem::Problem;
 use crate::solver::recorder::Recorder;
 

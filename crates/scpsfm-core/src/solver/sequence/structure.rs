@@ -4,11 +4,12 @@ use nalgebra::Vector3;
 
 use super::model::{Landmark, Model};
 use super::options::ExtensionOptions;
+use crate::domain::VERIFIED;
 use crate::geometry::Point;
 use crate::geometry::observation::Observation;
 use crate::geometry::robust_triangulation::{Triangulator, or_zeros};
 use crate::solver::per_track::each_track;
-use crate::solver::problem::{Problem, VERIFIED};
+use crate::solver::problem::Problem;
 use crate::solver::recorder::Recorder;
 
 const OPTIONS: ExtensionOptions = ExtensionOptions::DEFAULT;

@@ -9,7 +9,6 @@ use rand::SeedableRng;
 use rand_chacha::ChaCha8Rng;
 
 use super::options::{GrowthOptions, TripletOptions};
-use super::projective::ProjectiveReconstruction;
 use crate::domain::Stage;
 use crate::geometry::bundle;
 use crate::geometry::fundamental::{self, Fundamental, Match};
@@ -18,10 +17,11 @@ use crate::geometry::robust_triangulation::Triangulator;
 use crate::geometry::statistics::ln_choose;
 use crate::geometry::three_views::{self, FundamentalMatrices};
 use crate::geometry::{Camera, triangulation};
-use crate::solver::Error;
 use crate::solver::a_contrario::FalseAlarmOptions;
 use crate::solver::attempt::Attempt;
+use crate::solver::error::Error;
 use crate::solver::problem::Problem;
+use crate::solver::projective::ProjectiveReconstruction;
 use crate::solver::recorder::Recorder;
 use crate::solver::view_selection::evenly;
 

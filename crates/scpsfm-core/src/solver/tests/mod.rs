@@ -13,6 +13,7 @@ mod triplets;
 mod two_views;
 
 use super::*;
+use crate::domain::StopReason;
 use crate::domain::{
     Backend, FocalPrior, Grade, Limits, Method, Progress, Proposal, RawInput, Silent, Stage, Status, View, WarningCode,
 };

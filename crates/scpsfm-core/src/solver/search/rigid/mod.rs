@@ -329,14 +329,14 @@ mod tests {
     use super::*;
     use crate::domain::{Input, Limits};
     use crate::solver::a_contrario::FalseAlarmOptions;
-    use crate::solver::{block, portfolio};
+    use crate::solver::{block, spread};
     use crate::synthetic::{Scene, SceneOptions};
 
     fn found(options: &SceneOptions) -> (Scene, Option<Rigid>, f64) {
         let scene = Scene::generate(options).expect("valid options");
         let input = Input::new(scene.input.clone(), &Limits::default(), "scene").expect("valid scene");
         let block = block::of_all_views(&input);
-        let spread = portfolio::spread(&block.complete);
+        let spread = spread::spread(&block.complete);
         let stop = StopToken::default();
         let search = RigidSearch::new(&block.complete, spread, &stop).expect("depths");
         let rigid = search.run(options.noise.max(0.001));

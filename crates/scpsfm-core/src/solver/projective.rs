@@ -2,16 +2,16 @@
 
 use nalgebra::{Matrix4, Vector4};
 
+use super::block::Block;
+use super::consensus::{self, Consensus};
+use super::noise_model::evidence;
+use super::problem::Problem;
+use super::view_selection::evenly;
 use crate::geometry::bundle::projective;
 use crate::geometry::observation::Observation;
 use crate::geometry::statistics::core_noise;
 use crate::geometry::triangulation::weighted_squared;
 use crate::geometry::{Camera, Point};
-use crate::solver::block::Block;
-use crate::solver::classification::evidence;
-use crate::solver::grow::{self, Consensus};
-use crate::solver::problem::Problem;
-use crate::solver::view_selection::evenly;
 
 /// Cameras and points up to a common projective transform, with the observations that agree with them.
 #[derive(Debug, Clone)]
@@ -40,7 +40,7 @@ impl ProjectiveReconstruction {
             cameras: consensus.cameras.clone(),
             tracks: inliers.iter().map(|&track| block.tracks[track]).collect(),
             points: inliers.iter().map(|&track| consensus.points[track]).collect(),
-            observations: grow::observations_of(&block.complete, &inliers),
+            observations: consensus::observations_of(&block.complete, &inliers),
             noise: consensus.noise,
             tried: block.tracks.len(),
         }
