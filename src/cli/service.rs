@@ -27,7 +27,7 @@ const CLOSE_BOUND: Duration = Duration::from_secs(5);
 
 /// A running service.
 pub struct Service {
-    store: Arc<dyn Store>,
+    store: Arc<Store>,
     engine: Engine,
     server: Server,
     http: Option<http::Server>,
@@ -174,18 +174,18 @@ async fn bind(
     Ok((server, Some(http)))
 }
 
-async fn give_back(engine: &Engine, store: &dyn Store) {
+async fn give_back(engine: &Engine, store: &Store) {
     engine.drain(Duration::ZERO).await;
     close(store).await;
 }
 
-async fn close(store: &dyn Store) {
+async fn close(store: &Store) {
     if timeout(CLOSE_BOUND, store.close()).await.is_err() {
         tracing::warn!("the store does not close; nothing that was acknowledged is lost by that");
     }
 }
 
-async fn open_store(config: &config::Store) -> Result<Arc<dyn Store>, Failure> {
+async fn open_store(config: &config::Store) -> Result<Arc<Store>, Failure> {
     if let Some(url) = &config.url {
         let failed = |error| Failure::internal(format_args!("cannot open the store {url}: {error}"));
         return Ok(Arc::new(Postgres::open(url).await.map_err(failed)?));

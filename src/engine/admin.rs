@@ -76,7 +76,7 @@ impl Inner {
         }
         let retried = self.store.retry_job(name, etag, &self.options.queue, self.now()).await;
         let reply = retried.inspect_err(observe::refused_by_store)?;
-        if reply.queued_now {
+        if reply.by_this_call {
             tracing::info!(job = %name, "retried");
             self.notifier.wake(name);
             self.work_waits();

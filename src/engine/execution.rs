@@ -53,7 +53,7 @@ pub(super) async fn in_time<T>(
 }
 
 /// The input of a job, with the cancel that may have come before the job was listed as running.
-async fn read(store: Arc<dyn Store>, name: JobName, stop: StopToken) -> Result<Vec<u8>, store::Error> {
+async fn read(store: Arc<Store>, name: JobName, stop: StopToken) -> Result<Vec<u8>, store::Error> {
     let payload = store.job_payload(&name).await?;
     if payload.cancel_requested {
         stop.stop(StopReason::Cancelled);

@@ -29,8 +29,8 @@ use tokio::sync::{Notify, watch as channel};
 use tokio_util::sync::CancellationToken;
 
 pub use crate::store::{
-    Bound, Clock, EncodedResult, Error as StoreError, InputPage, InputQuery, JobPage, JobQuery, NewUpload, Order,
-    QueueBounds, QueueReport, QueueStats, StoredInput, TakenId, TenantQueue, TenantShares, UploadBounds, UploadStatus,
+    Bound, Clock, EncodedResult, Error as StoreError, InputQuery, JobQuery, NewUpload, Order, Page, QueueBounds,
+    QueueReport, QueueStats, StoredInput, TakenId, TenantQueue, TenantShares, UploadBounds, UploadStatus,
 };
 pub use crate::telemetry::metrics::GivenUp;
 pub use drain::Drained;
@@ -100,7 +100,7 @@ enum Phase {
 
 struct Inner {
     options: Options,
-    store: Arc<dyn Store>,
+    store: Arc<Store>,
     notifier: Arc<notifier::Notifier>,
     /// Attempts that run in this process or are prefetched, for a cancel to reach them at once.
     running: Mutex<running::RunningAttempts>,
@@ -132,7 +132,7 @@ impl Engine {
     /// [`Error::Internal`] when the store or a thread refuses.
     pub async fn start(
         options: Options,
-        store: Arc<dyn Store>,
+        store: Arc<Store>,
         solver: Solver,
         encode: ResultEncoder,
     ) -> Result<Self, Error> {
@@ -140,7 +140,7 @@ impl Engine {
         Self::start_with(options, store, threads).await
     }
 
-    async fn start_with(mut options: Options, store: Arc<dyn Store>, threads: drain::Threads) -> Result<Self, Error> {
+    async fn start_with(mut options: Options, store: Arc<Store>, threads: drain::Threads) -> Result<Self, Error> {
         options.lease = options.lease.clamp(Options::MIN_LEASE, Options::MAX_LEASE);
         let recovered = store.recover(options.clock.now(), options.max_attempts).await?;
         let inner = Arc::new(Inner {
@@ -208,10 +208,10 @@ impl Engine {
     ///
     /// # Errors
     /// [`StoreError::PageToken`].
-    pub async fn list(&self, query: &JobQuery) -> Result<JobPage, Error> {
+    pub async fn list(&self, query: &JobQuery) -> Result<Page<Job>, Error> {
         let page = self.inner.store.jobs(query).await?;
-        let jobs = page.jobs.into_iter().map(|job| self.inner.dated(job)).collect();
-        Ok(JobPage { jobs, ..page })
+        let jobs = page.items.into_iter().map(|job| self.inner.dated(job)).collect();
+        Ok(Page { items: jobs, ..page })
     }
 
     /// Replays a job's events after a sequence number (0: all of them), then follows it to its end. See [`Watch`].
@@ -347,7 +347,7 @@ impl Inner {
     async fn cancel(&self, name: &JobName, etag: Option<&str>) -> Result<Job, Error> {
         let reply = self.store.request_cancel(name, etag, self.now()).await?;
         self.stop_attempts(name);
-        if reply.ended_now {
+        if reply.by_this_call {
             self.ended(&reply.job);
         }
         Ok(self.dated(reply.job))

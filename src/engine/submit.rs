@@ -234,7 +234,7 @@ impl Inner {
     async fn store_jobs(&self, records: Vec<NewRecord>, now: SystemTime) -> Result<Vec<Job>, Error> {
         let created = self.store.create_jobs(records, &self.options.queue, now).await;
         let created = created.inspect_err(observe::refused_by_store)?;
-        let new = created.iter().filter(|created| created.new).count();
+        let new = created.iter().filter(|created| created.by_this_call).count();
         (0..new).for_each(|_| observe::job_created());
         if new > 0 {
             self.work_waits();

@@ -6,8 +6,8 @@ use std::time::Duration;
 use super::{Engine, Error, Inner, Phase, finished, observe};
 use crate::domain::{Input, InputName};
 use crate::store::{
-    self, BegunUpload, InputPage, InputQuery, NewInput, NewUpload, StoredInput, UploadBounds, UploadLease,
-    UploadStatus, payload,
+    self, BegunUpload, InputQuery, NewInput, NewUpload, Page, StoredInput, UploadBounds, UploadLease, UploadStatus,
+    payload,
 };
 
 /// How much may be uploaded, and how long the unfinished is kept.
@@ -91,7 +91,7 @@ impl Engine {
     ///
     /// # Errors
     /// [`StoreError::PageToken`].
-    pub async fn list_inputs(&self, query: &InputQuery) -> Result<InputPage, Error> {
+    pub async fn list_inputs(&self, query: &InputQuery) -> Result<Page<StoredInput>, Error> {
         Ok(self.inner.store.inputs(query).await?)
     }
 

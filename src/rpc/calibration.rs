@@ -14,16 +14,12 @@ use super::disconnect::{AttachedCall, DisconnectTracker};
 use super::inflight::Permit;
 use super::inputs::MAX_CHUNK_BYTES;
 use super::jobs::MAX_BATCH;
-use super::submission::Submission;
+use super::submission::{self, Submission};
 use super::{proto, status};
 use crate::domain::job::EventBody;
 use crate::domain::{Backend, Limits, Method, SolveSettings};
 use crate::engine::{self, Engine, QueueBounds, UploadOptions};
 use crate::{solver, telemetry};
-
-/// How long a `Solve` may be silent before its input is complete. A dead connection is found by keep-alive long before;
-/// this is for a caller that lives and forgets.
-const MESSAGE_TIMEOUT: Duration = Duration::from_secs(60);
 
 /// What the transport bounds, as the server tells it.
 #[derive(Debug, Clone, Copy)]
@@ -56,13 +52,12 @@ impl Calibration {
         mut messages: Streaming<proto::SolveRequest>,
     ) -> Result<Submission, Status> {
         let Some(proto::SolveRequest { message: Some(proto::solve_request::Message::Config(config)) }) =
-            next(&mut messages).await?
+            submission::next(&mut messages, permit).await?
         else {
             return Err(status::violation("config", "is not the first message"));
         };
-        permit.next_message();
         let mut submission = Submission::open(caller, config, &self.limits, permit)?;
-        while let Some(message) = next(&mut messages).await? {
+        while let Some(message) = submission::next(&mut messages, permit).await? {
             submission.append(message)?;
         }
         Ok(submission)
@@ -81,13 +76,6 @@ impl Calibration {
             stored.map(|job| disconnects.attached(job))
         };
         tokio::spawn(stored.in_current_span()).await.map_err(|error| status::internal(&error))?
-    }
-}
-
-async fn next(messages: &mut Streaming<proto::SolveRequest>) -> Result<Option<proto::SolveRequest>, Status> {
-    match tokio::time::timeout(MESSAGE_TIMEOUT, messages.message()).await {
-        Ok(message) => message,
-        Err(_) => Err(status::input_stalled(MESSAGE_TIMEOUT)),
     }
 }
 

@@ -1,7 +1,6 @@
 //! `InputService`.
 
 use std::sync::Arc;
-use std::time::Duration;
 
 use tokio::sync::Semaphore;
 use tonic::{Request, Response, Status, Streaming};
@@ -11,7 +10,7 @@ use super::caller::Caller;
 use super::convert::{self, input, size_to_wire};
 use super::inflight::{Permit, WORKING_COPIES};
 use super::upload_reader::{self, UploadReader};
-use super::{proto, status};
+use super::{proto, status, submission};
 use crate::domain::{InputName, Limits};
 use crate::engine::{self, Begun, Engine, GivenUp, InputQuery, NewUpload, Upload};
 use proto::upload_input_request::Message;
@@ -24,9 +23,6 @@ pub const MAX_MESSAGE_BYTES: usize = MAX_CHUNK_BYTES + 1024;
 
 /// What is gathered before it is stored: smaller chunks would be a commit each.
 const WRITE_BYTES: usize = MAX_CHUNK_BYTES;
-
-/// How long a stream may be silent, as in `Solve`.
-const MESSAGE_TIMEOUT: Duration = Duration::from_secs(60);
 
 /// Uploads that are decoded at a time, so that others are not kept waiting for the processor; more wait for their turn.
 const DECODED_AT_ONCE: usize = 2;
@@ -231,12 +227,7 @@ impl Reception {
 }
 
 async fn next(messages: &mut Streaming<proto::UploadInputRequest>, permit: &Permit) -> Result<Option<Message>, Status> {
-    let message = match tokio::time::timeout(MESSAGE_TIMEOUT, messages.message()).await {
-        Ok(message) => message?,
-        Err(_) => return Err(status::input_stalled(MESSAGE_TIMEOUT)),
-    };
-    permit.next_message();
-    match message {
+    match submission::next(messages, permit).await? {
         None => Ok(None),
         Some(proto::UploadInputRequest { message: Some(message) }) => Ok(Some(message)),
         Some(_) => Err(status::violation("message", "is not set")),
@@ -298,7 +289,7 @@ impl proto::input_service_server::InputService for Inputs {
         let query = InputQuery { tenant, page_size, page_token: Some(page_token) };
         let page = self.engine.list_inputs(&query).await?;
         Ok(Response::new(proto::ListInputsResponse {
-            inputs: page.inputs.iter().map(input::uploaded_to_wire).collect(),
+            inputs: page.items.iter().map(input::uploaded_to_wire).collect(),
             next_page_token: page.next_page_token.unwrap_or_default(),
         }))
     }

@@ -183,7 +183,7 @@ impl proto::job_service_server::JobService for Jobs {
         };
         let page = self.engine.list(&query).await?;
         Ok(Response::new(proto::ListJobsResponse {
-            jobs: page.jobs.iter().map(job::to_wire).collect(),
+            jobs: page.items.iter().map(job::to_wire).collect(),
             next_page_token: page.next_page_token.unwrap_or_default(),
         }))
     }

@@ -195,24 +195,17 @@ impl Listener {
         tokio::spawn(async move {
             let _place = place;
             let Established { mut io, early, .. } = established;
-            if is_http_1 {
-                let answering = async {
-                    io.write_all(NO_ROOM_HTTP_1).await?;
-                    io.shutdown().await?;
-                    tokio::io::copy(&mut io, &mut tokio::io::sink()).await
+            if !is_http_1 {
+                let called = async {
+                    io.write_all(NO_SETTINGS).await?;
+                    io.flush().await?;
+                    if early == PREFACE[..] { first_call(&mut io).await } else { Ok(()) }
                 };
-                let _ = tokio::time::timeout(REFUSAL_TIMEOUT, answering).await;
-                return;
+                // Whoever does not call is answered all the same.
+                let _ = tokio::time::timeout(REFUSED_CALL_TIMEOUT, called).await;
             }
-            let called = async {
-                io.write_all(NO_SETTINGS).await?;
-                io.flush().await?;
-                if early == PREFACE[..] { first_call(&mut io).await } else { Ok(()) }
-            };
-            // Whoever does not call is answered all the same.
-            let _ = tokio::time::timeout(REFUSED_CALL_TIMEOUT, called).await;
             let answering = async {
-                io.write_all(NO_ROOM).await?;
+                io.write_all(if is_http_1 { NO_ROOM_HTTP_1 } else { NO_ROOM }).await?;
                 io.shutdown().await?;
                 // A socket that is closed with bytes that nobody read is reset, and what it said may be lost with it.
                 tokio::io::copy(&mut io, &mut tokio::io::sink()).await

@@ -1,7 +1,9 @@
 //! What `CreateJob` and `Solve` share: from a request to a job that the engine may store. Nothing is stored before
 //! everything is checked, and its memory is charged to the call's permit.
 
-use tonic::Status;
+use std::time::Duration;
+
+use tonic::{Status, Streaming};
 use tracing::Instrument;
 
 use super::caller::Caller;
@@ -14,6 +16,10 @@ use crate::domain::{InputName, InvalidInput, Limits, Violation};
 use crate::engine::{self, Engine, JobInput, NewJob};
 use crate::telemetry::metrics::{Refusal, refused};
 use proto::create_job_request::Source as Inline;
+
+/// How long a stream may be silent before its input is complete. A dead connection is found by keep-alive long before;
+/// this is for a caller that lives and forgets.
+const MESSAGE_TIMEOUT: Duration = Duration::from_secs(60);
 
 /// A job whose input may still be on its way.
 pub struct Submission {
@@ -82,7 +88,6 @@ impl Submission {
         }
         .map_err(invalid)?;
         self.check_size()?;
-        self.permit.next_message();
         self.charge(1)
     }
 
@@ -158,6 +163,19 @@ pub async fn store(
         stored
     };
     tokio::spawn(storing.in_current_span()).await.map_err(|error| status::internal(&error))?
+}
+
+/// The next message of a stream that brings an input; its bytes are charged as the largest so far.
+///
+/// # Errors
+/// `DEADLINE_EXCEEDED` where none comes.
+pub async fn next<T>(messages: &mut Streaming<T>, permit: &Permit) -> Result<Option<T>, Status> {
+    let Ok(message) = tokio::time::timeout(MESSAGE_TIMEOUT, messages.message()).await else {
+        return Err(status::input_stalled(MESSAGE_TIMEOUT));
+    };
+    let message = message?;
+    permit.next_message();
+    Ok(message)
 }
 
 fn invalid(error: InvalidInput) -> Status {

@@ -87,12 +87,6 @@ impl LeaseClock {
         time(micros(now).saturating_add(ahead).saturating_sub(set))
     }
 
-    /// As if the clocks were so far apart.
-    #[cfg(test)]
-    pub(super) fn pretend(&self, ahead: Duration) {
-        self.locked().ahead = as_micros(ahead);
-    }
-
     fn locked(&self) -> std::sync::MutexGuard<'_, Reading> {
         self.reading.lock().unwrap_or_else(PoisonError::into_inner)
     }
@@ -109,6 +103,13 @@ mod tests {
     use super::*;
 
     const DAY: i64 = 86_400_000_000;
+
+    impl LeaseClock {
+        /// As if the clocks were so far apart.
+        pub(in crate::store) fn pretend(&self, ahead: Duration) {
+            self.locked().ahead = as_micros(ahead);
+        }
+    }
 
     /// A wall clock that is set by so many microseconds.
     fn settable() -> (Clock, Arc<AtomicI64>) {

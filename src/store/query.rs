@@ -1,4 +1,4 @@
-//! Listing jobs: the query, the page, and the token that leads to the next one; what listings of other things share.
+//! Listing jobs and uploaded inputs: the queries, a page, and the token that leads to the next one.
 
 use std::collections::BTreeMap;
 use std::fmt::Debug;
@@ -6,7 +6,7 @@ use std::fmt::Debug;
 use sha2::{Digest, Sha256};
 
 use super::Error;
-use crate::domain::job::{DEFAULT_TENANT, Job, JobName, JobState};
+use crate::domain::job::{DEFAULT_TENANT, JobName, JobState};
 
 /// Order of a listing.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
@@ -38,42 +38,62 @@ impl JobQuery {
     pub const DEFAULT_PAGE_SIZE: u32 = 50;
     /// Keeps an answer well under the message limit.
     pub const MAX_PAGE_SIZE: u32 = 1000;
+}
+
+/// Which uploaded inputs of a tenant to list, the newest first.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct InputQuery {
+    pub tenant: String,
+    /// As in [`JobQuery`].
+    pub page_size: u32,
+    /// `None` or empty: the first page.
+    pub page_token: Option<String>,
+}
+
+/// A query that is answered page by page.
+pub(super) trait Paged {
+    /// The size and the token of the page that is asked for.
+    fn asked(&self) -> (u32, Option<&str>);
+
+    /// The token of the page that begins after `cursor`.
+    fn token_after(&self, cursor: &Cursor) -> String;
 
     /// The page size in force.
-    pub fn effective_page_size(&self) -> u32 {
-        effective(self.page_size)
+    fn effective_page_size(&self) -> u32 {
+        match self.asked().0 {
+            0 => JobQuery::DEFAULT_PAGE_SIZE,
+            size => size.min(JobQuery::MAX_PAGE_SIZE),
+        }
     }
 
-    /// Where the page begins; `None`: at the first job.
+    /// Where the page begins; `None`: at the first one of all.
     ///
     /// # Errors
     /// [`Error::PageToken`] for a token that was not made for this query (AIP-158: only the page size may change).
-    pub(super) fn cursor(&self) -> Result<Option<Cursor>, Error> {
-        cursor_of(self.page_token.as_deref(), |cursor| self.token_after(cursor))
+    fn cursor(&self) -> Result<Option<Cursor>, Error> {
+        let Some(token) = self.asked().1.filter(|token| !token.is_empty()) else { return Ok(None) };
+        let cursor = Cursor::parse(token).filter(|cursor| self.token_after(cursor) == token);
+        cursor.map(Some).ok_or(Error::PageToken)
+    }
+}
+
+impl Paged for JobQuery {
+    fn asked(&self) -> (u32, Option<&str>) {
+        (self.page_size, self.page_token.as_deref())
     }
 
-    /// The token of the page that begins after `cursor`.
-    pub(super) fn token_after(&self, cursor: &Cursor) -> String {
+    fn token_after(&self, cursor: &Cursor) -> String {
         cursor.token(&(&self.tenant, &self.states, &self.labels, self.order))
     }
 }
 
-/// The page size in force where this one is asked for.
-pub(super) fn effective(page_size: u32) -> u32 {
-    match page_size {
-        0 => JobQuery::DEFAULT_PAGE_SIZE,
-        size => size.min(JobQuery::MAX_PAGE_SIZE),
+impl Paged for InputQuery {
+    fn asked(&self) -> (u32, Option<&str>) {
+        (self.page_size, self.page_token.as_deref())
     }
-}
 
-/// Where the page of this token begins: a query whose tokens are those of `token_after`.
-pub(super) fn cursor_of(token: Option<&str>, token_after: impl Fn(&Cursor) -> String) -> Result<Option<Cursor>, Error> {
-    match token {
-        None | Some("") => Ok(None),
-        Some(token) => {
-            let cursor = Cursor::parse(token).filter(|cursor| token_after(cursor) == token);
-            cursor.map(Some).ok_or(Error::PageToken)
-        }
+    fn token_after(&self, cursor: &Cursor) -> String {
+        cursor.token(&("inputs", &self.tenant))
     }
 }
 
@@ -91,9 +111,9 @@ impl Default for JobQuery {
 }
 
 /// One page of a listing.
-#[derive(Debug, Clone, PartialEq)]
-pub struct JobPage {
-    pub jobs: Vec<Job>,
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Page<T> {
+    pub items: Vec<T>,
     /// `None` on the last page.
     pub next_page_token: Option<String>,
 }
@@ -125,7 +145,7 @@ impl Cursor {
 
 #[cfg(test)]
 mod tests {
-    use super::{Cursor, JobQuery, Order};
+    use super::{Cursor, JobQuery, Order, Paged};
     use crate::store::Error;
 
     #[test]

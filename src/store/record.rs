@@ -72,12 +72,13 @@ pub struct Request {
     pub digest: [u8; 32],
 }
 
-/// What a creation came to.
+/// What a call came to that asks for a change of a job which may have been made before.
 #[derive(Debug, Clone, PartialEq)]
-pub struct Created {
+pub struct Changed {
+    /// The job as it stands now.
     pub job: Job,
-    /// `false`: an earlier call with the same request id had made it.
-    pub new: bool,
+    /// Whether this call made the change: it created the job, ended it, or put it into the queue.
+    pub by_this_call: bool,
 }
 
 /// What waits and what runs.
@@ -258,24 +259,6 @@ pub enum Outcome {
     Failed(Failure),
     Cancelled,
     DeadlineExceeded,
-}
-
-/// What asking for a cancel came to.
-#[derive(Debug, Clone, PartialEq)]
-pub struct CancelReply {
-    /// The job as it stands now.
-    pub job: Job,
-    /// Whether this call ended it.
-    pub ended_now: bool,
-}
-
-/// What asking for a retry came to.
-#[derive(Debug, Clone, PartialEq)]
-pub struct RetryReply {
-    /// The job as it stands now.
-    pub job: Job,
-    /// Whether this call put it into the queue.
-    pub queued_now: bool,
 }
 
 /// The queue as its administrator sees it.

@@ -3,7 +3,7 @@
 //!
 //! Nothing here waits for a thread: all time that passes is that of tokio's paused clock.
 
-use std::ops::{Deref, DerefMut};
+use std::ops::Deref;
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::time::{Duration, SystemTime};
 
@@ -14,10 +14,9 @@ use tokio::sync::{OwnedMutexGuard, broadcast};
 use tokio::time::{Instant, sleep};
 
 use super::clock::LeaseClock;
-use super::sql::{Change, Connection, Database, Operation, Row, Size, Statement, WriteIntent, micros};
-use super::sqlite::{WriteConnection, WrittenRow};
-use super::{Clock, Error, Notification};
-use crate::domain::job::JobName;
+use super::sql::{Connection, Database, Operation, Row, Size, Statement, WriteIntent, micros};
+use super::sqlite::WriteConnection;
+use super::{Clock, Error, Notification, Store};
 
 /// Notifications that a server may be behind before it is told that some are lost.
 const NOTIFICATIONS: usize = 16;
@@ -140,6 +139,14 @@ pub(crate) struct Simulated<const SHARED: bool> {
     notifications: tokio::sync::Mutex<broadcast::Receiver<Notification>>,
 }
 
+impl<const SHARED: bool> Deref for Simulated<SHARED> {
+    type Target = Store;
+
+    fn deref(&self) -> &Store {
+        self
+    }
+}
+
 /// Which way something is on the link.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 enum Way {
@@ -182,23 +189,23 @@ impl<const SHARED: bool> Simulated<SHARED> {
     }
 }
 
+#[async_trait::async_trait]
 impl<const SHARED: bool> Database for Simulated<SHARED> {
-    type Writing = SimulatedConnection;
-    type Reading = ReadConnection;
-
-    const SHARED: bool = SHARED;
-
-    async fn reader(&self, _size: Size) -> Result<ReadConnection, Error> {
-        self.pass(Way::There).await?;
-        Ok(ReadConnection(self.cluster.connection.clone().lock_owned().await))
+    fn is_shared(&self) -> bool {
+        SHARED
     }
 
-    async fn write<T: Send + 'static>(
+    async fn reader(&self, _size: Size) -> Result<Box<dyn Connection>, Error> {
+        self.pass(Way::There).await?;
+        Ok(Box::new(ReadConnection(self.cluster.connection.clone().lock_owned().await)))
+    }
+
+    async fn write(
         &self,
         _size: Size,
         intent: WriteIntent,
-        operation: Operation<SimulatedConnection, T>,
-    ) -> Result<T, Error> {
+        operation: Operation<dyn Connection, ()>,
+    ) -> Result<(), Error> {
         self.pass(Way::There).await?;
         let is_full = self.locked().faults.full;
         let outcome = {
@@ -244,7 +251,7 @@ impl<const SHARED: bool> Database for Simulated<SHARED> {
         !self.locked().faults.full
     }
 
-    async fn next_notification(&self) -> Notification {
+    async fn notification(&self) -> Notification {
         if !SHARED {
             return std::future::pending().await;
         }
@@ -264,17 +271,10 @@ impl<const SHARED: bool> Database for Simulated<SHARED> {
 /// The one connection, lent to a reader.
 pub(crate) struct ReadConnection(OwnedMutexGuard<SimulatedConnection>);
 
-impl Deref for ReadConnection {
-    type Target = SimulatedConnection;
-
-    fn deref(&self) -> &SimulatedConnection {
-        &self.0
-    }
-}
-
-impl DerefMut for ReadConnection {
-    fn deref_mut(&mut self) -> &mut SimulatedConnection {
-        &mut self.0
+#[async_trait::async_trait]
+impl Connection for ReadConnection {
+    async fn rows(&mut self, statement: Statement) -> Result<Vec<Row>, Error> {
+        self.0.rows(statement).await
     }
 }
 
@@ -290,7 +290,7 @@ pub(crate) struct SimulatedConnection {
 
 impl SimulatedConnection {
     /// Runs an operation in a transaction. On a full disk one that is to begin something may write nothing.
-    async fn transaction<T: 'static>(&mut self, operation: &Operation<Self, T>, is_full: bool) -> Result<T, Error> {
+    async fn transaction(&mut self, operation: &Operation<dyn Connection, ()>, is_full: bool) -> Result<(), Error> {
         self.inner.control("BEGIN IMMEDIATE")?;
         let before = self.inner.changes();
         let mut outcome = operation(self).await;
@@ -300,12 +300,12 @@ impl SimulatedConnection {
                  RETURNING id, last_sequence",
             );
             let late = late.bind(&lease.name.tenant).bind(&lease.name.job);
-            if let Some(job) = self.inner.optional_row(late).await? {
+            if let [job] = self.inner.rows(late).await?.as_slice() {
                 let (id, sequence) = (job.integer("id")?, job.integer("last_sequence")?);
                 let insert = "INSERT INTO events SELECT job_id, $1, $2, time, body FROM events \
                               WHERE job_id = $3 AND sequence = 1";
                 let insert = Statement::new(insert).bind(sequence).bind(lease.attempt).bind(id);
-                self.inner.execute(insert).await?;
+                self.inner.rows(insert).await?;
             }
             self.inner.control("COMMIT")?;
             return outcome;
@@ -323,10 +323,9 @@ impl SimulatedConnection {
     }
 }
 
+#[async_trait::async_trait]
 impl Connection for SimulatedConnection {
-    type Row = WrittenRow;
-
-    async fn rows(&mut self, statement: Statement) -> Result<Vec<WrittenRow>, Error> {
+    async fn rows(&mut self, statement: Statement) -> Result<Vec<Row>, Error> {
         let bug = self.bug;
         let statement = match bug {
             Some(Bug::DoubleClaim) if statement.sql().contains("ORDER BY priority") => {
@@ -351,24 +350,8 @@ impl Connection for SimulatedConnection {
         Ok(rows)
     }
 
-    async fn notify(&mut self, change: Change, job: &JobName) -> Result<(), Error> {
-        self.committing.push(match change {
-            Change::Events => Notification::Events(job.clone()),
-            Change::Queued => Notification::Queued,
-            Change::Cancel => Notification::Cancel(job.clone()),
-        });
+    async fn notify(&mut self, notification: Notification) -> Result<(), Error> {
+        self.committing.push(notification);
         Ok(())
     }
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-    use crate::store::contract::store_contract;
-
-    async fn open() -> Option<Arc<Simulated<true>>> {
-        Some(Arc::new(Cluster::new(None).connect(0, SystemTime::UNIX_EPOCH)))
-    }
-
-    store_contract!(open);
 }

@@ -46,7 +46,7 @@ async fn one_request_is_one_job_however_often_it_is_sent() {
         assert!(matches!(test.engine.submit(other).await, Err(Error::Store(StoreError::AlreadyExists(_)))));
     }
     assert_eq!(test.solver.calls.load(Ordering::SeqCst), 1);
-    assert_eq!(test.engine.list(&JobQuery::default()).await.expect("lists").jobs.len(), 1);
+    assert_eq!(test.engine.list(&JobQuery::default()).await.expect("lists").items.len(), 1);
 }
 
 #[tokio::test]

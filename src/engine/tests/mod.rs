@@ -24,7 +24,6 @@ use crate::domain::{
     Status, StopToken, View,
 };
 use crate::solver;
-use crate::store::Store;
 use crate::store::sqlite::Sqlite;
 
 /// What the solver is to do with a job, passed as the job's seed.

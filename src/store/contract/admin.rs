@@ -5,17 +5,17 @@ use crate::domain::Quota;
 use crate::domain::job::AttachedCalls;
 use crate::store::{Claims, TenantQueue};
 
-async fn retry(store: &dyn Store, name: &JobName, seconds: u64) -> Result<Job, Error> {
+async fn retry(store: &Store, name: &JobName, seconds: u64) -> Result<Job, Error> {
     store.retry_job(name, None, &ROOM, time(seconds)).await.map(|reply| reply.job)
 }
 
 /// Claims the next job at that second and loses it.
-async fn lose(store: &dyn Store, seconds: u64) -> Job {
+async fn lose(store: &Store, seconds: u64) -> Job {
     claim(store, seconds).await;
     store.sweep(time(seconds + 30), MAX_ATTEMPTS).await.expect("sweeps").lost.remove(0)
 }
 
-pub(in crate::store) async fn a_retried_job_begins_anew_and_its_events_go_on(store: &dyn Store) {
+pub(in crate::store) async fn a_retried_job_begins_anew_and_its_events_go_on(store: &Store) {
     let new = NewRecord { deadline: Some(time(1_000)), cancel_on_disconnect: true, priority: 3, ..labelled("a") };
     let created = create(store, new, 0).await;
     assert_eq!(created.attached_calls, Some(AttachedCalls { attached: 1, detached: 0 }));
@@ -30,7 +30,7 @@ pub(in crate::store) async fn a_retried_job_begins_anew_and_its_events_go_on(sto
     assert_eq!((failed.state, failed.attempt, failed.last_sequence), (JobState::Failed, 4, 10));
 
     let reply = store.retry_job(&name, Some(&failed.etag()), &ROOM, time(500)).await.expect("retries");
-    assert!(reply.queued_now);
+    assert!(reply.by_this_call);
     let job = reply.job;
     assert_eq!((job.state, job.attempt, job.last_sequence), (JobState::Queued, 4, 11));
     assert_eq!((&job.failure, job.progress, job.start_time, job.end_time), (&None, None, None, None));
@@ -43,14 +43,14 @@ pub(in crate::store) async fn a_retried_job_begins_anew_and_its_events_go_on(sto
     assert_eq!(store.purge(time(1_000_000), 10).await, Ok(0));
     // Once more, as after an answer that was lost.
     let again = store.retry_job(&name, None, &ROOM, time(501)).await.expect("is queued");
-    assert_eq!((again.queued_now, again.job), (false, job));
+    assert_eq!((again.by_this_call, again.job), (false, job));
 
     // The fencing token goes on, and the attempts of before do not count.
     let claimed = claim(store, 502).await;
     assert_eq!((claimed.lease.attempt, claimed.queue_time, claimed.job.start_time), (5, time(500), Some(time(502))));
     assert_eq!(store.heartbeat(&old, time(502), LEASE).await, Err(Error::Fenced(old)));
     assert_eq!(
-        store.retry_job(&name, None, &ROOM, time(502)).await.map(|reply| reply.queued_now),
+        store.retry_job(&name, None, &ROOM, time(502)).await.map(|reply| reply.by_this_call),
         Ok(false),
         "it runs"
     );
@@ -81,7 +81,7 @@ pub(in crate::store) async fn a_retried_job_begins_anew_and_its_events_go_on(sto
     assert_eq!(result_of(store, &name).await, Ok(Some(vec![1])));
 }
 
-pub(in crate::store) async fn a_retry_is_refused_where_there_is_nothing_to_do_or_no_room(store: &dyn Store) {
+pub(in crate::store) async fn a_retry_is_refused_where_there_is_nothing_to_do_or_no_room(store: &Store) {
     let cancelled = create(store, record("cancelled"), 0).await;
     store.request_cancel(&cancelled.name, None, time(1)).await.expect("ends");
     let due = create(store, NewRecord { deadline: Some(time(1)), ..record("due") }, 0).await.name;
@@ -109,7 +109,7 @@ pub(in crate::store) async fn a_retry_is_refused_where_there_is_nothing_to_do_or
     assert_eq!(retry(store, &cancelled.name, 8).await.expect("there is room").state, JobState::Queued);
 }
 
-pub(in crate::store) async fn only_waiting_jobs_get_another_priority(store: &dyn Store) {
+pub(in crate::store) async fn only_waiting_jobs_get_another_priority(store: &Store) {
     let first = create(store, record("first"), 0).await;
     let second = create(store, record("second"), 1).await;
     let changed = store.set_priority(&second.name, Some(&second.etag()), 7).await.expect("waits");
@@ -128,7 +128,7 @@ pub(in crate::store) async fn only_waiting_jobs_get_another_priority(store: &dyn
     assert_eq!(store.set_priority(&none, None, 1).await, Err(Error::NotFound(none.clone())));
 }
 
-pub(in crate::store) async fn a_paused_queue_gives_out_no_job(store: &dyn Store) {
+pub(in crate::store) async fn a_paused_queue_gives_out_no_job(store: &Store) {
     create(store, record("a"), 0).await;
     create(store, record("b"), 1).await;
     let lease = claim(store, 2).await.lease;
@@ -151,7 +151,7 @@ pub(in crate::store) async fn a_paused_queue_gives_out_no_job(store: &dyn Store)
     assert_eq!(claim(store, 10).await.job.name.job, "b");
 }
 
-pub(in crate::store) async fn a_report_counts_jobs_by_state_and_tenant(store: &dyn Store) {
+pub(in crate::store) async fn a_report_counts_jobs_by_state_and_tenant(store: &Store) {
     let empty = store.queue(20).await.expect("reports");
     assert!(empty.jobs.iter().all(|(_, count)| *count == 0) && empty.oldest.is_none() && empty.tenants.is_empty());
     let of = |tenant: &str, job: &str| {

@@ -4,7 +4,7 @@ use super::*;
 use crate::domain::{Oversize, Quota};
 use crate::store::TakenId;
 
-pub(in crate::store) async fn a_created_job_reads_back(store: &dyn Store) {
+pub(in crate::store) async fn a_created_job_reads_back(store: &Store) {
     let now = time(0) + Duration::from_micros(1);
     let labels = BTreeMap::from([("scene".to_owned(), "door".to_owned()), ("é \"'".to_owned(), "%_".to_owned())]);
     // More than two rows, and not a whole number of them.
@@ -18,7 +18,7 @@ pub(in crate::store) async fn a_created_job_reads_back(store: &dyn Store) {
         ..record("a")
     };
     let created = store.create_job(new.clone(), &ROOM, now).await.expect("created");
-    assert!(created.new);
+    assert!(created.by_this_call);
     let expected = Job {
         name: new.name.clone(),
         state: JobState::Queued,
@@ -53,7 +53,7 @@ pub(in crate::store) async fn a_created_job_reads_back(store: &dyn Store) {
     assert_eq!(claimed.queue_time, now);
 }
 
-pub(in crate::store) async fn a_request_id_stands_for_one_body_and_one_job(store: &dyn Store) {
+pub(in crate::store) async fn a_request_id_stands_for_one_body_and_one_job(store: &Store) {
     let request = |byte| Some(Request { id: "r".into(), digest: [byte; 32] });
     let first = create(store, NewRecord { request: request(1), ..record("a") }, 0).await;
     claim(store, 1).await;
@@ -61,7 +61,7 @@ pub(in crate::store) async fn a_request_id_stands_for_one_body_and_one_job(store
     let full = QueueBounds { max_jobs: 0, ..ROOM };
     let again = NewRecord { request: request(1), ..record("b") };
     let repeated = store.create_job(again, &full, time(2)).await.expect("known");
-    assert!(!repeated.new);
+    assert!(!repeated.by_this_call);
     assert_eq!(repeated.job.name, first.name);
     assert_eq!(repeated.job.state, JobState::Running, "the job as it stands now");
     let asked = |byte| request(byte).expect("one");
@@ -75,28 +75,28 @@ pub(in crate::store) async fn a_request_id_stands_for_one_body_and_one_job(store
     let mut other_tenant = NewRecord { request: request(2), ..record("a") };
     other_tenant.name.tenant = "u".into();
     let theirs = store.create_job(other_tenant, &ROOM, time(2)).await.expect("request ids are the tenant's");
-    assert!(theirs.new);
+    assert!(theirs.by_this_call);
 }
 
-pub(in crate::store) async fn one_request_id_from_many_callers_is_one_job(store: &dyn Store) {
+pub(in crate::store) async fn one_request_id_from_many_callers_is_one_job(store: &Store) {
     let call = |number: usize| {
         let request = Some(Request { id: "r".into(), digest: [1; 32] });
         store.create_job(NewRecord { request, ..record(&format!("job-{number}")) }, &ROOM, time(0))
     };
     let created = futures_util::future::join_all((0..50).map(call)).await;
     let created: Vec<_> = created.into_iter().map(|created| created.expect("created or known")).collect();
-    assert_eq!(created.iter().filter(|created| created.new).count(), 1);
+    assert_eq!(created.iter().filter(|created| created.by_this_call).count(), 1);
     assert!(created.iter().all(|other| other.job.name == created[0].job.name));
     assert_eq!(store.queue_stats().await.expect("counts").queued, 1);
 }
 
-pub(in crate::store) async fn a_taken_job_id_is_refused(store: &dyn Store) {
+pub(in crate::store) async fn a_taken_job_id_is_refused(store: &Store) {
     create(store, record("a"), 0).await;
     let error = store.create_job(record("a"), &ROOM, time(1)).await.expect_err("taken");
     assert_eq!(error, Error::AlreadyExists(TakenId::Job(JobName { tenant: "t".into(), job: "a".into() })));
 }
 
-pub(in crate::store) async fn admission_bounds_what_waits(store: &dyn Store) {
+pub(in crate::store) async fn admission_bounds_what_waits(store: &Store) {
     let refused = |bounds: QueueBounds| async move {
         match store.create_job(record("late"), &bounds, time(1)).await {
             Err(Error::QueueFull(bound)) => bound,
@@ -126,7 +126,7 @@ pub(in crate::store) async fn admission_bounds_what_waits(store: &dyn Store) {
     store.create_job(record("c"), &exact, time(3)).await.expect("what runs does not wait");
 }
 
-pub(in crate::store) async fn admission_bounds_each_tenant(store: &dyn Store) {
+pub(in crate::store) async fn admission_bounds_each_tenant(store: &Store) {
     let of = |tenant: &str, job: &str| {
         let mut new = record(job);
         new.name.tenant = tenant.into();
@@ -149,7 +149,7 @@ pub(in crate::store) async fn admission_bounds_each_tenant(store: &dyn Store) {
     store.create_job(of("t", "c"), &bounds, time(2)).await.expect("what runs does not wait");
 }
 
-pub(in crate::store) async fn a_batch_is_stored_whole_or_not_at_all(store: &dyn Store) {
+pub(in crate::store) async fn a_batch_is_stored_whole_or_not_at_all(store: &Store) {
     create(store, record("taken"), 0).await;
     let names = ["a", "b", "taken"];
     let batch: Vec<_> = names.map(record).to_vec();
@@ -176,13 +176,13 @@ pub(in crate::store) async fn a_batch_is_stored_whole_or_not_at_all(store: &dyn 
     assert!(matches!(store.job(&record("a").name).await, Err(Error::NotFound(_))), "nothing was stored");
     assert_eq!(store.queue_stats().await.expect("counts").queued, 1);
     let created = store.create_jobs(batch[..2].to_vec(), &ROOM, time(1)).await.expect("created");
-    let created: Vec<_> = created.iter().map(|created| (created.job.name.job.as_str(), created.new)).collect();
+    let created: Vec<_> = created.iter().map(|created| (created.job.name.job.as_str(), created.by_this_call)).collect();
     assert_eq!(created, [("a", true), ("b", true)]);
     assert_eq!(store.queue_stats().await.expect("counts").queued_bytes, 300);
     assert_eq!(store.job_payload(&record("b").name).await.map(|payload| payload.input), Ok(vec![7; 100]));
 }
 
-pub(in crate::store) async fn a_batch_knows_its_request_ids(store: &dyn Store) {
+pub(in crate::store) async fn a_batch_knows_its_request_ids(store: &Store) {
     let request = |id: &str, byte| Some(Request { id: id.into(), digest: [byte; 32] });
     let batch = || {
         vec![
@@ -193,7 +193,7 @@ pub(in crate::store) async fn a_batch_knows_its_request_ids(store: &dyn Store) {
     };
     for news in [[true, true, false], [false, false, false]] {
         let created = store.create_jobs(batch(), &ROOM, time(0)).await.expect("created or known");
-        assert_eq!(created.iter().map(|created| created.new).collect::<Vec<_>>(), news);
+        assert_eq!(created.iter().map(|created| created.by_this_call).collect::<Vec<_>>(), news);
         assert_eq!(created.iter().map(|created| created.job.name.job.as_str()).collect::<Vec<_>>(), ["a", "b", "a"]);
     }
     let mut other = batch();
@@ -204,7 +204,7 @@ pub(in crate::store) async fn a_batch_knows_its_request_ids(store: &dyn Store) {
     assert_eq!(store.queue_stats().await.expect("counts").queued, 2);
 }
 
-pub(in crate::store) async fn a_batch_that_never_fits_is_told_so(store: &dyn Store) {
+pub(in crate::store) async fn a_batch_that_never_fits_is_told_so(store: &Store) {
     let batch = |count: usize| (0..count).map(|k| record(&format!("job-{k}"))).collect::<Vec<_>>();
     let refused = async |new: Vec<NewRecord>, bounds: QueueBounds| match store.create_jobs(new, &bounds, time(0)).await
     {
@@ -236,10 +236,10 @@ pub(in crate::store) async fn a_batch_that_never_fits_is_told_so(store: &dyn Sto
     let bounds = QueueBounds { max_jobs: 4, ..ROOM };
     let batch = vec![known.clone(), fresh.clone(), fresh.clone(), known.clone(), fresh];
     let created = store.create_jobs(batch, &bounds, time(1)).await.expect("one more fits");
-    assert_eq!(created.iter().filter(|created| created.new).count(), 1);
+    assert_eq!(created.iter().filter(|created| created.by_this_call).count(), 1);
 }
 
-pub(in crate::store) async fn only_a_job_that_its_call_created_depends_on_calls(store: &dyn Store) {
+pub(in crate::store) async fn only_a_job_that_its_call_created_depends_on_calls(store: &Store) {
     let of = |id: &str, cancel_on_disconnect| {
         let request = Some(Request { id: id.into(), digest: [1; 32] });
         NewRecord { request, cancel_on_disconnect, ..record(id) }

@@ -3,7 +3,7 @@
 use super::*;
 use crate::store::{Claims, Prefetch, QueueStats};
 
-pub(in crate::store) async fn claims_go_by_priority_then_age(store: &dyn Store) {
+pub(in crate::store) async fn claims_go_by_priority_then_age(store: &Store) {
     for (job, priority, seconds) in [("old", 0, 0), ("new", 0, 2), ("same", 0, 2), ("low", -1, 0), ("high", 5, 9)] {
         create(store, NewRecord { priority, ..record(job) }, seconds).await;
     }
@@ -19,7 +19,7 @@ pub(in crate::store) async fn claims_go_by_priority_then_age(store: &dyn Store) 
     assert_eq!(store.claim(&Claim::one("worker", LEASE), time(20)).await, Ok(Claims::default()));
 }
 
-pub(in crate::store) async fn no_job_is_claimed_twice(store: &dyn Store) {
+pub(in crate::store) async fn no_job_is_claimed_twice(store: &Store) {
     for number in 0..30 {
         create(store, record(&format!("job-{number}")), 0).await;
     }
@@ -36,7 +36,7 @@ pub(in crate::store) async fn no_job_is_claimed_twice(store: &dyn Store) {
 const KEPT: Duration = Duration::from_secs(5);
 
 /// Claims the next job, or begins with one that was prefetched, and prefetches the one after it.
-async fn prefetching(store: &dyn Store, begin: Option<&Claimed>, seconds: u64) -> Claims {
+async fn prefetching(store: &Store, begin: Option<&Claimed>, seconds: u64) -> Claims {
     let begin = begin.map(|prefetched| (prefetched.lease.clone(), prefetched.job.create_time));
     let prefetch = Some(Prefetch { lease_for: KEPT, max_observations: record("").observation_count });
     // Of a worker among others, to which nothing is a suspect.
@@ -44,7 +44,7 @@ async fn prefetching(store: &dyn Store, begin: Option<&Claimed>, seconds: u64) -
     store.claim(&claim, time(seconds)).await.expect("claims")
 }
 
-pub(in crate::store) async fn a_prefetched_job_waits_until_it_is_begun(store: &dyn Store) {
+pub(in crate::store) async fn a_prefetched_job_waits_until_it_is_begun(store: &Store) {
     assert_eq!(prefetching(store, None, 0).await, Claims::default());
     for (job, priority) in [("second", 0), ("first", 1), ("third", 0)] {
         create(store, NewRecord { priority, ..record(job) }, 0).await;
@@ -75,7 +75,7 @@ pub(in crate::store) async fn a_prefetched_job_waits_until_it_is_begun(store: &d
     assert_eq!(store.job(&third.job.name).await, Ok(third.job), "no attempt was made");
 }
 
-pub(in crate::store) async fn a_prefetched_job_is_begun_by_whoever_comes_first(store: &dyn Store) {
+pub(in crate::store) async fn a_prefetched_job_is_begun_by_whoever_comes_first(store: &Store) {
     for job in ["first", "second", "third"] {
         create(store, record(job), 0).await;
     }
@@ -100,7 +100,7 @@ pub(in crate::store) async fn a_prefetched_job_is_begun_by_whoever_comes_first(s
     create(store, record("eighth"), 22).await;
     let eighth = prefetching(store, None, 23).await.prefetched.expect("a job");
     let reply = store.request_cancel(&eighth.job.name, None, time(23)).await.expect("ends");
-    assert!(reply.ended_now, "it is queued");
+    assert!(reply.by_this_call, "it is queued");
     assert_eq!(prefetching(store, Some(&eighth), 23).await, Claims::default());
     store.delete_job(&eighth.job.name, None).await.expect("has ended");
     create(store, record("seventh-again"), 24).await;
@@ -111,7 +111,7 @@ pub(in crate::store) async fn a_prefetched_job_is_begun_by_whoever_comes_first(s
     assert!(prefetching(store, Some(&again), 24).await.begun.is_some());
 }
 
-pub(in crate::store) async fn large_jobs_and_late_ones_are_not_prefetched(store: &dyn Store) {
+pub(in crate::store) async fn large_jobs_and_late_ones_are_not_prefetched(store: &Store) {
     create(store, record("first"), 0).await;
     let large = NewRecord { observation_count: record("").observation_count + 1, ..record("large") };
     create(store, large, 1).await;
@@ -128,7 +128,7 @@ pub(in crate::store) async fn large_jobs_and_late_ones_are_not_prefetched(store:
     assert_eq!(begun.map(|claimed| claimed.lease), Some(last.lease), "kept long, and still there");
 }
 
-pub(in crate::store) async fn a_suspect_is_begun_only_where_nothing_else_runs(store: &dyn Store) {
+pub(in crate::store) async fn a_suspect_is_begun_only_where_nothing_else_runs(store: &Store) {
     let busy = Claim { suspect_after: Some(2), ..Claim::one("worker", LEASE) };
     let name = create(store, record("suspect"), 0).await.name;
     for seconds in [100, 200] {
@@ -178,7 +178,7 @@ pub(in crate::store) async fn a_suspect_is_begun_only_where_nothing_else_runs(st
     assert_eq!(states, expected);
 }
 
-pub(in crate::store) async fn a_lease_that_was_taken_over_writes_nothing(store: &dyn Store) {
+pub(in crate::store) async fn a_lease_that_was_taken_over_writes_nothing(store: &Store) {
     let name = create(store, record("a"), 0).await.name;
     let old = claim(store, 0).await.lease;
     store.record(&old, &progress(1), time(1)).await.expect("holds");
@@ -221,7 +221,7 @@ pub(in crate::store) async fn a_lease_that_was_taken_over_writes_nothing(store: 
     assert_eq!(story(store, &name).await, told(&expected));
 }
 
-pub(in crate::store) async fn a_success_stores_its_result_then_its_state(store: &dyn Store) {
+pub(in crate::store) async fn a_success_stores_its_result_then_its_state(store: &Store) {
     let name = create(store, record("a"), 0).await.name;
     let lease = claim(store, 1).await.lease;
     let result: Vec<u8> = (0..3 * payload::CHUNK_BYTES).map(|k| (k % 253) as u8).collect();
@@ -237,7 +237,7 @@ pub(in crate::store) async fn a_success_stores_its_result_then_its_state(store: 
     assert_eq!(story(store, &name).await, told(&expected));
 }
 
-pub(in crate::store) async fn progress_is_an_event_and_stands_in_the_job(store: &dyn Store) {
+pub(in crate::store) async fn progress_is_an_event_and_stands_in_the_job(store: &Store) {
     let name = create(store, record("a"), 0).await.name;
     let lease = claim(store, 1).await.lease;
     assert_eq!(store.record(&lease, &progress(50), time(2)).await, Ok(3));
@@ -252,7 +252,7 @@ pub(in crate::store) async fn progress_is_an_event_and_stands_in_the_job(store: 
     assert_eq!(again.job.progress, None, "a new attempt begins anew");
 }
 
-pub(in crate::store) async fn every_outcome_ends_in_its_state(store: &dyn Store) {
+pub(in crate::store) async fn every_outcome_ends_in_its_state(store: &Store) {
     let failure = Failure::new("INTERNAL", "a defect");
     let outcomes = [
         (Outcome::Failed(failure.clone()), JobState::Failed, "FAILED:INTERNAL"),
@@ -271,7 +271,7 @@ pub(in crate::store) async fn every_outcome_ends_in_its_state(store: &dyn Store)
     assert_eq!(store.queue_stats().await, Ok(QueueStats::default()));
 }
 
-pub(in crate::store) async fn giving_back_is_free_and_vanishing_is_not(store: &dyn Store) {
+pub(in crate::store) async fn giving_back_is_free_and_vanishing_is_not(store: &Store) {
     let name = create(store, record("a"), 0).await.name;
     for attempt in 1..=5 {
         let lease = claim(store, 1).await.lease;
@@ -304,13 +304,13 @@ pub(in crate::store) async fn giving_back_is_free_and_vanishing_is_not(store: &d
     assert_eq!(store.claim(&Claim::one("worker", LEASE), time(101)).await, Ok(Claims::default()));
 }
 
-pub(in crate::store) async fn a_cancel_ends_what_waits_and_flags_what_runs(store: &dyn Store) {
+pub(in crate::store) async fn a_cancel_ends_what_waits_and_flags_what_runs(store: &Store) {
     let waiting = create(store, record("waiting"), 0).await.name;
     let reply = store.request_cancel(&waiting, None, time(1)).await.expect("cancels");
-    assert!(reply.ended_now);
+    assert!(reply.by_this_call);
     assert_eq!((reply.job.state, reply.job.end_time), (JobState::Cancelled, Some(time(1))));
     let again = store.request_cancel(&waiting, None, time(2)).await.expect("is idempotent");
-    assert_eq!((again.ended_now, again.job), (false, reply.job));
+    assert_eq!((again.by_this_call, again.job), (false, reply.job));
     assert_eq!(story(store, &waiting).await, told(&[(1, 0, "QUEUED"), (2, 0, "CANCELLED")]));
 
     // Released, its worker vanished, or ended by its worker: a flagged job never runs again.
@@ -319,7 +319,7 @@ pub(in crate::store) async fn a_cancel_ends_what_waits_and_flags_what_runs(store
         let lease = claim(store, 1).await.lease;
         assert!(!store.heartbeat(&lease, time(1), LEASE).await.expect("holds").cancel_requested);
         let reply = store.request_cancel(&name, None, time(2)).await.expect("flags");
-        assert!(!reply.ended_now && reply.job.cancel_requested && reply.job.state == JobState::Running);
+        assert!(!reply.by_this_call && reply.job.cancel_requested && reply.job.state == JobState::Running);
         assert!(store.heartbeat(&lease, time(2), LEASE).await.expect("holds").cancel_requested);
         let job = match way {
             "released" => store.release(&lease, time(3)).await.expect("gives back"),
@@ -333,7 +333,7 @@ pub(in crate::store) async fn a_cancel_ends_what_waits_and_flags_what_runs(store
     }
 }
 
-pub(in crate::store) async fn deadlines_end_what_waits(store: &dyn Store) {
+pub(in crate::store) async fn deadlines_end_what_waits(store: &Store) {
     let due = create(store, NewRecord { deadline: Some(time(10)), priority: 9, ..record("due") }, 0).await.name;
     let later = create(store, NewRecord { deadline: Some(time(50)), ..record("later") }, 0).await.name;
     let claimed = claim(store, 10).await;

@@ -10,14 +10,17 @@ pub(super) mod uploads;
 pub(super) mod webhooks;
 
 use std::collections::BTreeMap;
+use std::ops::Deref;
 use std::sync::Arc;
 use std::time::{Duration, SystemTime};
 
 use crate::domain::job::{AttemptEnd, EventBody, Failure, Job, JobName, JobState, PastAttempt, Summary};
 use crate::domain::{Progress, ReconstructionProgress, SolveSettings, Stage, Status, Step, Task};
+use crate::store::postgres::Postgres;
 use crate::store::record::{NewRecord, Request};
+use crate::store::sqlite::Sqlite;
 use crate::store::{
-    ATTEMPTS_EXHAUSTED, Bound, Claim, Claimed, EncodedResult, Ending, Error, JobQuery, Lease, Order, Outcome,
+    ATTEMPTS_EXHAUSTED, Bound, Changed, Claim, Claimed, EncodedResult, Ending, Error, JobQuery, Lease, Order, Outcome,
     QueueBounds, Store, payload,
 };
 
@@ -137,11 +140,39 @@ pub(super) fn record(job: &str) -> NewRecord {
     }
 }
 
-async fn create(store: &dyn Store, new: NewRecord, seconds: u64) -> Job {
+impl Store {
+    /// Stores one job.
+    pub(crate) async fn create_job(
+        &self,
+        new: NewRecord,
+        bounds: &QueueBounds,
+        now: SystemTime,
+    ) -> Result<Changed, Error> {
+        Ok(self.create_jobs(vec![new], bounds, now).await?.pop().expect("one of one"))
+    }
+}
+
+impl Deref for Sqlite {
+    type Target = Store;
+
+    fn deref(&self) -> &Store {
+        self
+    }
+}
+
+impl Deref for Postgres {
+    type Target = Store;
+
+    fn deref(&self) -> &Store {
+        self
+    }
+}
+
+async fn create(store: &Store, new: NewRecord, seconds: u64) -> Job {
     store.create_job(new, &ROOM, time(seconds)).await.expect("created").job
 }
 
-async fn claim(store: &dyn Store, seconds: u64) -> Claimed {
+async fn claim(store: &Store, seconds: u64) -> Claimed {
     store.claim(&Claim::one("worker", LEASE), time(seconds)).await.expect("claims").begun.expect("a job waits")
 }
 
@@ -188,7 +219,7 @@ fn success(result: Vec<u8>) -> Arc<Ending> {
 }
 
 /// The bytes of a job's result, which must be those that were stored.
-async fn result_of(store: &dyn Store, name: &JobName) -> Result<Option<Vec<u8>>, Error> {
+async fn result_of(store: &Store, name: &JobName) -> Result<Option<Vec<u8>>, Error> {
     let result = store.result(name).await?;
     assert!(result.as_ref().is_none_or(EncodedResult::is_intact));
     Ok(result.map(|result| result.bytes))
@@ -200,7 +231,7 @@ pub(super) fn labelled(job: &str) -> NewRecord {
 }
 
 /// The events of a job as `(sequence, attempt, what)`.
-async fn story(store: &dyn Store, name: &JobName) -> Vec<(u64, u32, String)> {
+async fn story(store: &Store, name: &JobName) -> Vec<(u64, u32, String)> {
     let events = store.events_after(name, 0, 1000).await.expect("events");
     events
         .into_iter()

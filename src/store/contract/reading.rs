@@ -2,7 +2,7 @@
 
 use super::*;
 
-pub(in crate::store) async fn listings_page_and_filter(store: &dyn Store) {
+pub(in crate::store) async fn listings_page_and_filter(store: &Store) {
     for number in 0..7 {
         let mut labels = BTreeMap::from([("parity".to_owned(), (number % 2).to_string())]);
         labels.insert("all".into(), "x".into());
@@ -21,8 +21,8 @@ pub(in crate::store) async fn listings_page_and_filter(store: &dyn Store) {
         let mut listed = Vec::new();
         loop {
             let page = store.jobs(&query).await.expect("lists");
-            assert!(page.jobs.len() <= 2);
-            listed.extend(names(&page.jobs));
+            assert!(page.items.len() <= 2);
+            listed.extend(names(&page.items));
             query.page_token = page.next_page_token;
             if query.page_token.is_none() {
                 break;
@@ -34,7 +34,7 @@ pub(in crate::store) async fn listings_page_and_filter(store: &dyn Store) {
         }
         assert_eq!(listed, expected);
     }
-    let listed = |query: JobQuery| async move { names(&store.jobs(&query).await.expect("lists").jobs) };
+    let listed = |query: JobQuery| async move { names(&store.jobs(&query).await.expect("lists").items) };
     let running = JobQuery { states: vec![JobState::Running, JobState::Failed], ..base.clone() };
     assert_eq!(listed(running).await, ["job-0"]);
     let labels = BTreeMap::from([("parity".to_owned(), "1".to_owned()), ("all".to_owned(), "x".to_owned())]);
@@ -48,7 +48,7 @@ pub(in crate::store) async fn listings_page_and_filter(store: &dyn Store) {
     assert_eq!(store.jobs(&bad).await, Err(Error::PageToken));
 }
 
-pub(in crate::store) async fn events_come_in_order_and_in_portions(store: &dyn Store) {
+pub(in crate::store) async fn events_come_in_order_and_in_portions(store: &Store) {
     let name = create(store, record("a"), 0).await.name;
     create(store, record("b"), 0).await;
     let lease = claim(store, 1).await.lease;
@@ -68,7 +68,7 @@ pub(in crate::store) async fn events_come_in_order_and_in_portions(store: &dyn S
     assert_eq!(sequences, (1..=12).collect::<Vec<_>>());
 }
 
-pub(in crate::store) async fn what_does_not_exist_is_not_found(store: &dyn Store) {
+pub(in crate::store) async fn what_does_not_exist_is_not_found(store: &Store) {
     create(store, record("a"), 0).await;
     let name = JobName { tenant: "u".into(), job: "a".into() };
     let missing = Error::NotFound(name.clone());
@@ -81,7 +81,7 @@ pub(in crate::store) async fn what_does_not_exist_is_not_found(store: &dyn Store
     assert_eq!(store.heartbeat(&lease, time(0), LEASE).await, Err(Error::Fenced(lease)));
 }
 
-pub(crate) async fn operators_see_tenants_the_oldest_job_and_bytes(store: &dyn Store) {
+pub(crate) async fn operators_see_tenants_the_oldest_job_and_bytes(store: &Store) {
     let empty = store.stats().await.expect("counts");
     assert_eq!((empty.oldest_queue_time, empty.tenants.len()), (None, 0));
     assert!(empty.bytes > 0, "a schema takes room");

@@ -3,13 +3,13 @@
 use super::*;
 
 /// A job that succeeded at that second.
-async fn succeeded(store: &dyn Store, new: NewRecord, seconds: u64) -> Job {
+async fn succeeded(store: &Store, new: NewRecord, seconds: u64) -> Job {
     create(store, new, 0).await;
     let lease = claim(store, 0).await.lease;
     store.finish(&lease, &success(vec![1, 2, 3]), time(seconds)).await.expect("finishes")
 }
 
-async fn exists(store: &dyn Store, name: &JobName) -> bool {
+async fn exists(store: &Store, name: &JobName) -> bool {
     match store.job(name).await {
         Ok(_) => true,
         Err(Error::NotFound(_)) => false,
@@ -17,7 +17,7 @@ async fn exists(store: &dyn Store, name: &JobName) -> bool {
     }
 }
 
-pub(in crate::store) async fn an_ended_job_goes_with_all_that_it_had(store: &dyn Store) {
+pub(in crate::store) async fn an_ended_job_goes_with_all_that_it_had(store: &Store) {
     let request = Some(Request { id: "r".into(), digest: [1; 32] });
     let labels = BTreeMap::from([("a".to_owned(), "b".to_owned())]);
     let new = NewRecord { request, labels: labels.clone(), ..record("a") };
@@ -31,18 +31,18 @@ pub(in crate::store) async fn an_ended_job_goes_with_all_that_it_had(store: &dyn
     assert_eq!(result_of(store, &name).await, Err(missing.clone()));
     assert_eq!(store.delete_job(&name, None).await, Err(missing));
     let query = JobQuery { tenant: "t".into(), labels, ..JobQuery::default() };
-    assert!(store.jobs(&query).await.expect("lists").jobs.is_empty());
+    assert!(store.jobs(&query).await.expect("lists").items.is_empty());
     assert_eq!(store.job(&other.name).await, Ok(other.clone()), "others stay");
     assert_eq!(store.job_payload(&other.name).await.map(|payload| payload.input), Ok(vec![7; 100]));
     assert_eq!(result_of(store, &other.name).await, Ok(Some(vec![1, 2, 3])));
     // Name and request id are free again, and the new job has nothing of the old one.
     let created = store.create_job(new, &ROOM, time(5)).await.expect("created");
-    assert!(created.new);
+    assert!(created.by_this_call);
     assert_eq!(story(store, &name).await, told(&[(1, 0, "QUEUED")]));
     assert_eq!(result_of(store, &name).await, Ok(None));
 }
 
-pub(in crate::store) async fn what_waits_or_runs_is_not_deleted(store: &dyn Store) {
+pub(in crate::store) async fn what_waits_or_runs_is_not_deleted(store: &Store) {
     let name = create(store, record("a"), 0).await.name;
     assert_eq!(store.delete_job(&name, None).await, Err(Error::NotEnded(name.clone(), JobState::Queued)));
     let lease = claim(store, 1).await.lease;
@@ -55,7 +55,7 @@ pub(in crate::store) async fn what_waits_or_runs_is_not_deleted(store: &dyn Stor
     assert_eq!(store.heartbeat(&lease, time(3), LEASE).await, Err(Error::Fenced(lease)));
 }
 
-pub(in crate::store) async fn an_etag_is_honoured_and_changes_with_the_job(store: &dyn Store) {
+pub(in crate::store) async fn an_etag_is_honoured_and_changes_with_the_job(store: &Store) {
     let queued = create(store, record("a"), 0).await;
     let name = queued.name.clone();
     let mut seen = vec![queued.etag()];
@@ -81,7 +81,7 @@ pub(in crate::store) async fn an_etag_is_honoured_and_changes_with_the_job(store
     assert_eq!(seen.len(), count, "no etag twice: {seen:?}");
 }
 
-pub(in crate::store) async fn what_ended_long_ago_goes_oldest_first_and_in_portions(store: &dyn Store) {
+pub(in crate::store) async fn what_ended_long_ago_goes_oldest_first_and_in_portions(store: &Store) {
     let mut names = Vec::new();
     for (job, seconds) in [("third", 30), ("first", 10), ("fourth", 40), ("second", 20)] {
         names.push(succeeded(store, record(job), seconds).await.name);

@@ -4,20 +4,20 @@ use super::*;
 use crate::store::{Claims, Prefetch, TenantShares};
 
 /// Stores so many jobs of a tenant, all at that time.
-async fn create_of(store: &dyn Store, tenant: &str, jobs: std::ops::Range<u32>, seconds: u64) {
+async fn create_of(store: &Store, tenant: &str, jobs: std::ops::Range<u32>, seconds: u64) {
     for number in jobs {
         let name = JobName { tenant: tenant.into(), job: format!("{tenant}-{number}") };
         create(store, NewRecord { name, ..record("") }, seconds).await;
     }
 }
 
-async fn claim_with(store: &dyn Store, shares: &TenantShares, prefetch: Option<Prefetch>) -> Claims {
+async fn claim_with(store: &Store, shares: &TenantShares, prefetch: Option<Prefetch>) -> Claims {
     let claim = Claim { shares: Arc::new(shares.clone()), prefetch, ..Claim::one("worker", LEASE) };
     store.claim(&claim, time(100)).await.expect("claims")
 }
 
 /// The ids of the next so many jobs that are begun.
-async fn begun(store: &dyn Store, shares: &TenantShares, count: usize) -> Vec<String> {
+async fn begun(store: &Store, shares: &TenantShares, count: usize) -> Vec<String> {
     let mut ids = Vec::new();
     for _ in 0..count {
         ids.push(claim_with(store, shares, None).await.begun.expect("a job").job.name.job);
@@ -26,11 +26,11 @@ async fn begun(store: &dyn Store, shares: &TenantShares, count: usize) -> Vec<St
 }
 
 /// The tenants of the next so many jobs that are begun, one letter each.
-async fn turns(store: &dyn Store, shares: &TenantShares, count: usize) -> String {
+async fn turns(store: &Store, shares: &TenantShares, count: usize) -> String {
     begun(store, shares, count).await.iter().map(|id| &id[..1]).collect()
 }
 
-pub(in crate::store) async fn tenants_take_turns_and_priority_counts_within_one(store: &dyn Store) {
+pub(in crate::store) async fn tenants_take_turns_and_priority_counts_within_one(store: &Store) {
     create_of(store, "a", 0..3, 0).await;
     let urgent = JobName { tenant: "a".into(), job: "a-urgent".into() };
     create(store, NewRecord { name: urgent, priority: 9, ..record("") }, 1).await;
@@ -42,7 +42,7 @@ pub(in crate::store) async fn tenants_take_turns_and_priority_counts_within_one(
     assert_eq!(claim_with(store, &equal, None).await, Claims::default());
 }
 
-pub(in crate::store) async fn weights_are_shares(store: &dyn Store) {
+pub(in crate::store) async fn weights_are_shares(store: &Store) {
     let shares = TenantShares { weights: BTreeMap::from([("b".into(), 3)]), ..TenantShares::default() };
     create_of(store, "a", 0..9, 0).await;
     create_of(store, "b", 0..9, 0).await;
@@ -53,7 +53,7 @@ pub(in crate::store) async fn weights_are_shares(store: &dyn Store) {
     assert_eq!(turns(store, &shares, 6).await, "aaaaaa", "who is alone has all");
 }
 
-pub(in crate::store) async fn weights_are_shares_where_jobs_are_prefetched(store: &dyn Store) {
+pub(in crate::store) async fn weights_are_shares_where_jobs_are_prefetched(store: &Store) {
     let shares = TenantShares { weights: BTreeMap::from([("b".into(), 3)]), ..TenantShares::default() };
     let prefetch = Some(Prefetch { lease_for: LEASE, max_observations: u32::MAX });
     create_of(store, "a", 0..20, 0).await;
@@ -72,7 +72,7 @@ pub(in crate::store) async fn weights_are_shares_where_jobs_are_prefetched(store
     assert_eq!((begun.matches('a').count(), begun.matches('b').count()), (10, 30), "{begun}");
 }
 
-pub(in crate::store) async fn an_idle_tenant_saves_nothing_up(store: &dyn Store) {
+pub(in crate::store) async fn an_idle_tenant_saves_nothing_up(store: &Store) {
     let equal = TenantShares::default();
     create_of(store, "a", 0..12, 0).await;
     assert_eq!(turns(store, &equal, 5).await, "aaaaa");
@@ -82,7 +82,7 @@ pub(in crate::store) async fn an_idle_tenant_saves_nothing_up(store: &dyn Store)
     assert_eq!(turns(store, &equal, 4).await, "baba");
 }
 
-pub(in crate::store) async fn the_running_jobs_of_a_tenant_are_bounded(store: &dyn Store) {
+pub(in crate::store) async fn the_running_jobs_of_a_tenant_are_bounded(store: &Store) {
     let shares = TenantShares { max_running: Some(2), ..TenantShares::default() };
     let prefetch = Some(Prefetch { lease_for: LEASE, max_observations: u32::MAX });
     create_of(store, "a", 0..5, 0).await;
@@ -104,7 +104,7 @@ pub(in crate::store) async fn the_running_jobs_of_a_tenant_are_bounded(store: &d
     assert_eq!(begun(store, &TenantShares::default(), 1).await, ["a-3"], "without a bound");
 }
 
-pub(in crate::store) async fn a_job_that_is_solved_leaves_its_place_before_its_end_is_stored(store: &dyn Store) {
+pub(in crate::store) async fn a_job_that_is_solved_leaves_its_place_before_its_end_is_stored(store: &Store) {
     let shares = TenantShares { max_running: Some(1), ..TenantShares::default() };
     create_of(store, "a", 0..3, 0).await;
     let first = claim_with(store, &shares, None).await.begun.expect("a job");
@@ -114,7 +114,7 @@ pub(in crate::store) async fn a_job_that_is_solved_leaves_its_place_before_its_e
     assert_eq!(store.claim(&claim, time(100)).await, Ok(Claims::default()), "the second one runs");
 }
 
-pub(in crate::store) async fn a_bound_holds_however_many_claim_at_once(store: &dyn Store) {
+pub(in crate::store) async fn a_bound_holds_however_many_claim_at_once(store: &Store) {
     let shares = TenantShares { max_running: Some(3), ..TenantShares::default() };
     create_of(store, "a", 0..12, 0).await;
     let claims = futures_util::future::join_all((0..12).map(|_| claim_with(store, &shares, None))).await;

@@ -4,7 +4,7 @@ use super::*;
 use crate::domain::{InputName, Oversize, Quota};
 use crate::store::record::JobInput;
 use crate::store::upload::{BegunUpload, NewInput, NewUpload, PurgedUploads, StoredInput, UploadLease};
-use crate::store::{InputPage, InputQuery, UploadBounds};
+use crate::store::{InputQuery, Page, UploadBounds};
 
 pub(in crate::store) const ROOMY: UploadBounds =
     UploadBounds { max_bytes: u64::MAX, max_tenant_uploads: u64::MAX, max_tenant_bytes: u64::MAX };
@@ -17,7 +17,7 @@ pub(in crate::store) fn new(input: &str, bytes: u64) -> NewUpload {
     NewUpload { name: name(input), bytes, sha256: None }
 }
 
-async fn begin(store: &dyn Store, new: &NewUpload, seconds: u64) -> (UploadLease, u64) {
+async fn begin(store: &Store, new: &NewUpload, seconds: u64) -> (UploadLease, u64) {
     match store.begin_upload(new, &ROOMY, time(seconds)).await.expect("begins") {
         BegunUpload::Open { lease, committed, .. } => (lease, committed),
         BegunUpload::Finished(input) => panic!("{input:?}"),
@@ -29,13 +29,13 @@ fn input(payload: Vec<u8>) -> Arc<NewInput> {
 }
 
 /// An upload of a few bytes that became an input at that second.
-pub(in crate::store) async fn finished(store: &dyn Store, id: &str, payload: Vec<u8>, seconds: u64) -> StoredInput {
+pub(in crate::store) async fn finished(store: &Store, id: &str, payload: Vec<u8>, seconds: u64) -> StoredInput {
     let (lease, _) = begin(store, &new(id, 4), seconds).await;
     store.append_upload(&lease, 0, &[1; 4], time(seconds)).await.expect("appends");
     store.finish_upload(&lease, &input(payload), time(seconds)).await.expect("finishes")
 }
 
-pub(in crate::store) async fn jobs_know_their_uploaded_inputs(store: &dyn Store) {
+pub(in crate::store) async fn jobs_know_their_uploaded_inputs(store: &Store) {
     finished(store, "a", vec![7; 10], 0).await;
     let with = NewRecord { input: JobInput::Uploaded { input: "a".into(), bytes: 10 }, ..record("with") };
     for new in [with, record("without")] {
@@ -46,7 +46,7 @@ pub(in crate::store) async fn jobs_know_their_uploaded_inputs(store: &dyn Store)
     assert_eq!(known("without").await, None);
 }
 
-async fn whole(store: &dyn Store, lease: &UploadLease) -> Vec<u8> {
+async fn whole(store: &Store, lease: &UploadLease) -> Vec<u8> {
     let mut bytes = Vec::new();
     loop {
         let part = store.read_upload(lease, bytes.len() as u64).await.expect("reads");
@@ -58,7 +58,7 @@ async fn whole(store: &dyn Store, lease: &UploadLease) -> Vec<u8> {
     }
 }
 
-pub(in crate::store) async fn an_upload_goes_on_where_it_ended_and_becomes_an_input(store: &dyn Store) {
+pub(in crate::store) async fn an_upload_goes_on_where_it_ended_and_becomes_an_input(store: &Store) {
     // More than one read brings, and cut where no row ends.
     let bytes: Vec<u8> = (0..6 * payload::CHUNK_BYTES + 17).map(|k| (k % 251) as u8).collect();
     let upload = new("a", bytes.len() as u64);
@@ -103,7 +103,7 @@ pub(in crate::store) async fn an_upload_goes_on_where_it_ended_and_becomes_an_in
     assert_eq!(store.uploaded_input(&foreign).await, Err(Error::InputNotFound(foreign)));
 }
 
-pub(in crate::store) async fn the_latest_stream_has_the_upload(store: &dyn Store) {
+pub(in crate::store) async fn the_latest_stream_has_the_upload(store: &Store) {
     let upload = new("a", 10);
     let (first, _) = begin(store, &upload, 0).await;
     store.append_upload(&first, 0, &[1; 3], time(0)).await.expect("appends");
@@ -128,7 +128,7 @@ pub(in crate::store) async fn the_latest_stream_has_the_upload(store: &dyn Store
     assert_eq!(whole(store, &third).await, [9; 4]);
 }
 
-pub(in crate::store) async fn an_upload_id_stands_for_one_length_and_hash(store: &dyn Store) {
+pub(in crate::store) async fn an_upload_id_stands_for_one_length_and_hash(store: &Store) {
     let hashed = |bytes, hash: Option<u8>| NewUpload { sha256: hash.map(|byte| [byte; 32]), ..new("a", bytes) };
     begin(store, &hashed(4, None), 0).await;
     begin(store, &hashed(4, Some(3)), 0).await;
@@ -150,7 +150,7 @@ pub(in crate::store) async fn an_upload_id_stands_for_one_length_and_hash(store:
     begin(store, &elsewhere, 2).await;
 }
 
-pub(in crate::store) async fn a_tenants_uploads_are_bounded(store: &dyn Store) {
+pub(in crate::store) async fn a_tenants_uploads_are_bounded(store: &Store) {
     let bounds = UploadBounds { max_tenant_uploads: 2, max_tenant_bytes: 400, ..ROOMY };
     let begin_within = |new: NewUpload| async move { store.begin_upload(&new, &bounds, time(0)).await };
     let refused = async |new: NewUpload| match begin_within(new).await {
@@ -178,7 +178,7 @@ pub(in crate::store) async fn a_tenants_uploads_are_bounded(store: &dyn Store) {
     begin_within(new("c", 200)).await.expect("what was given up takes no room");
 }
 
-pub(in crate::store) async fn what_nobody_goes_on_with_is_given_up_and_removed(store: &dyn Store) {
+pub(in crate::store) async fn what_nobody_goes_on_with_is_given_up_and_removed(store: &Store) {
     let (old, _) = begin(store, &new("old", 1 << 30), 0).await;
     // More rows than one look removes.
     let row = vec![5; payload::CHUNK_BYTES];
@@ -204,7 +204,7 @@ pub(in crate::store) async fn what_nobody_goes_on_with_is_given_up_and_removed(s
     store.reclaim().await.expect("gives back");
 }
 
-pub(in crate::store) async fn an_input_lives_as_long_as_a_job_has_it(store: &dyn Store) {
+pub(in crate::store) async fn an_input_lives_as_long_as_a_job_has_it(store: &Store) {
     let payload = vec![7; payload::CHUNK_BYTES + 3];
     finished(store, "used", payload.clone(), 0).await;
     finished(store, "unused", vec![8; 10], 0).await;
@@ -227,8 +227,8 @@ pub(in crate::store) async fn an_input_lives_as_long_as_a_job_has_it(store: &dyn
     // A repeated request neither needs the input again nor takes it away.
     let request = Some(Request { id: "r".into(), digest: [1; 32] });
     let repeated = || NewRecord { request: request.clone(), ..of("d", "used") };
-    assert!(store.create_job(repeated(), &ROOM, time(5)).await.expect("created").new);
-    assert!(!store.create_job(repeated(), &ROOM, time(5)).await.expect("known").new);
+    assert!(store.create_job(repeated(), &ROOM, time(5)).await.expect("created").by_this_call);
+    assert!(!store.create_job(repeated(), &ROOM, time(5)).await.expect("known").by_this_call);
     assert!(store.uploaded_input(&name("used")).await.is_ok());
 
     assert_eq!(store.purge_uploads(None, Some(time(100))).await, Ok(PurgedUploads { abandoned: 0, inputs: 1 }));
@@ -246,7 +246,7 @@ pub(in crate::store) async fn an_input_lives_as_long_as_a_job_has_it(store: &dyn
     assert!(store.uploaded_input(&name("used")).await.is_err());
 }
 
-pub(in crate::store) async fn a_finished_upload_that_is_begun_again_is_kept_as_one_that_is_used(store: &dyn Store) {
+pub(in crate::store) async fn a_finished_upload_that_is_begun_again_is_kept_as_one_that_is_used(store: &Store) {
     for input in ["asked", "forgotten"] {
         finished(store, input, vec![7; 10], 0).await;
     }
@@ -258,7 +258,7 @@ pub(in crate::store) async fn a_finished_upload_that_is_begun_again_is_kept_as_o
     assert_eq!(store.purge_uploads(None, Some(time(50))).await, Ok(PurgedUploads { abandoned: 0, inputs: 1 }));
 }
 
-pub(in crate::store) async fn inputs_are_listed_page_by_page(store: &dyn Store) {
+pub(in crate::store) async fn inputs_are_listed_page_by_page(store: &Store) {
     for (input, seconds) in [("a", 3), ("b", 1), ("c", 3), ("d", 2)] {
         finished(store, input, vec![7; 10], seconds).await;
     }
@@ -267,22 +267,22 @@ pub(in crate::store) async fn inputs_are_listed_page_by_page(store: &dyn Store) 
     let page = async |tenant: &str, page_size, page_token: Option<String>| {
         store.inputs(&InputQuery { tenant: tenant.into(), page_size, page_token }).await
     };
-    let ids = |page: &InputPage| page.inputs.iter().map(|input| input.name.input.clone()).collect::<Vec<_>>();
+    let ids = |page: &Page<StoredInput>| page.items.iter().map(|input| input.name.input.clone()).collect::<Vec<_>>();
     let whole = page("t", 0, None).await.expect("a page");
     assert_eq!((ids(&whole), &whole.next_page_token), (["c", "a", "d", "b"].map(str::to_owned).to_vec(), &None));
-    assert_eq!(whole.inputs[3], store.uploaded_input(&name("b")).await.expect("is there"));
+    assert_eq!(whole.items[3], store.uploaded_input(&name("b")).await.expect("is there"));
     let first = page("t", 3, None).await.expect("a page");
     assert_eq!(ids(&first), ["c", "a", "d"]);
     let token = first.next_page_token.clone();
     let second = page("t", 3, token.clone()).await.expect("a page");
     assert_eq!((ids(&second), second.next_page_token), (vec!["b".to_owned()], None));
-    assert_eq!(page("u", 0, None).await, Ok(InputPage { inputs: Vec::new(), next_page_token: None }));
+    assert_eq!(page("u", 0, None).await, Ok(Page { items: Vec::new(), next_page_token: None }));
     assert_eq!(page("u", 3, token.clone()).await, Err(Error::PageToken));
     let of_jobs = JobQuery { tenant: "t".into(), page_token: token, ..JobQuery::default() };
     assert_eq!(store.jobs(&of_jobs).await, Err(Error::PageToken), "a token of inputs is none of jobs");
 }
 
-pub(in crate::store) async fn a_deleted_input_is_kept_by_its_jobs_alone(store: &dyn Store) {
+pub(in crate::store) async fn a_deleted_input_is_kept_by_its_jobs_alone(store: &Store) {
     let payload = vec![7; payload::CHUNK_BYTES + 3];
     for input in ["shared", "free"] {
         finished(store, input, payload.clone(), 0).await;
@@ -334,7 +334,7 @@ pub(in crate::store) async fn a_deleted_input_is_kept_by_its_jobs_alone(store: &
     store.give_up_upload(&lease).await.expect("gives up");
 }
 
-pub(in crate::store) async fn many_that_begin_at_once_share_the_last_room(store: &dyn Store) {
+pub(in crate::store) async fn many_that_begin_at_once_share_the_last_room(store: &Store) {
     let bounds = UploadBounds { max_tenant_uploads: 3, ..ROOMY };
     let uploads: Vec<_> = (0..24).map(|number| new(&format!("upload-{}", number % 12), 10)).collect();
     let begun = uploads.iter().map(|upload| store.begin_upload(upload, &bounds, time(0)));

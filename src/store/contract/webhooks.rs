@@ -11,7 +11,7 @@ fn hooked(job: &str, url: &str) -> NewRecord {
 }
 
 /// A job with a webhook that succeeded at that second.
-async fn ended(store: &dyn Store, job: &str, url: &str, seconds: u64) -> JobName {
+async fn ended(store: &Store, job: &str, url: &str, seconds: u64) -> JobName {
     let name = create(store, hooked(job, url), 0).await.name;
     let lease = claim(store, 0).await.lease;
     assert_eq!(lease.name, name, "nothing else waits");
@@ -19,23 +19,23 @@ async fn ended(store: &dyn Store, job: &str, url: &str, seconds: u64) -> JobName
     name
 }
 
-async fn claim_webhook(store: &dyn Store, seconds: u64) -> Option<Job> {
+async fn claim_webhook(store: &Store, seconds: u64) -> Option<Job> {
     store.claim_webhook(&PassedOver::default(), time(seconds), LEASE).await.expect("claims")
 }
 
-async fn settle(store: &dyn Store, job: &Job, outcome: WebhookOutcome, seconds: u64) -> bool {
+async fn settle(store: &Store, job: &Job, outcome: WebhookOutcome, seconds: u64) -> bool {
     store.settle_webhook(job, &outcome, time(seconds)).await.expect("settles")
 }
 
-async fn webhook(store: &dyn Store, name: &JobName) -> Webhook {
+async fn webhook(store: &Store, name: &JobName) -> Webhook {
     store.job(name).await.expect("the job").webhook.expect("a webhook")
 }
 
-async fn queue(store: &dyn Store, seconds: u64) -> WebhookQueue {
+async fn queue(store: &Store, seconds: u64) -> WebhookQueue {
     store.webhook_queue(time(seconds)).await.expect("counts")
 }
 
-pub(in crate::store) async fn every_end_of_a_job_makes_its_webhook_due(store: &dyn Store) {
+pub(in crate::store) async fn every_end_of_a_job_makes_its_webhook_due(store: &Store) {
     let none = WebhookQueue { pending: 0, is_due: false };
     // A job without a webhook has nothing to tell.
     create(store, record("plain"), 0).await;
@@ -80,7 +80,7 @@ pub(in crate::store) async fn every_end_of_a_job_makes_its_webhook_due(store: &d
     assert_eq!(sent, expected.map(|(job, state)| (job.to_owned(), state)), "in the order of the jobs");
 }
 
-pub(in crate::store) async fn an_attempt_is_leased_and_settled_once(store: &dyn Store) {
+pub(in crate::store) async fn an_attempt_is_leased_and_settled_once(store: &Store) {
     let name = ended(store, "a", URL, 1).await;
     let first = claim_webhook(store, 1).await.expect("due");
     assert_eq!(first.webhook, Some(Webhook { attempts: 1, ..Webhook::pending(URL) }));
@@ -99,7 +99,7 @@ pub(in crate::store) async fn an_attempt_is_leased_and_settled_once(store: &dyn 
     assert_eq!(queue(store, 1_000_000).await, WebhookQueue { pending: 0, is_due: false });
 }
 
-pub(in crate::store) async fn a_failed_attempt_is_due_again_later_and_a_last_one_never(store: &dyn Store) {
+pub(in crate::store) async fn a_failed_attempt_is_due_again_later_and_a_last_one_never(store: &Store) {
     let name = ended(store, "a", URL, 1).await;
     let job = claim_webhook(store, 2).await.expect("due");
     let retry = WebhookOutcome::Retry { error: "away".into(), after: Duration::from_secs(100) };
@@ -117,7 +117,7 @@ pub(in crate::store) async fn a_failed_attempt_is_due_again_later_and_a_last_one
     assert_eq!(claim_webhook(store, 1_000_000).await, None);
 }
 
-pub(in crate::store) async fn a_retried_job_has_another_end_to_send(store: &dyn Store) {
+pub(in crate::store) async fn a_retried_job_has_another_end_to_send(store: &Store) {
     let name = create(store, hooked("a", URL), 0).await.name;
     let fail = || Arc::new(Ending { outcome: Outcome::Failed(Failure::new("INTERNAL", "a defect")), progress: None });
     let lease = claim(store, 0).await.lease;
@@ -137,7 +137,7 @@ pub(in crate::store) async fn a_retried_job_has_another_end_to_send(store: &dyn 
     assert!(settle(store, &second, WebhookOutcome::Delivered, 6).await);
 }
 
-pub(in crate::store) async fn busy_hosts_and_tenants_are_passed_over(store: &dyn Store) {
+pub(in crate::store) async fn busy_hosts_and_tenants_are_passed_over(store: &Store) {
     for (job, url, seconds) in
         [("a", "https://slow.example/a", 1), ("b", "https://slow.example/b", 2), ("c", "http://quick.example:81/", 3)]
     {
@@ -152,7 +152,7 @@ pub(in crate::store) async fn busy_hosts_and_tenants_are_passed_over(store: &dyn
     assert_eq!(claim_webhook(store, 4).await.map(|job| job.name.job), Some("a".into()));
 }
 
-pub(in crate::store) async fn no_delivery_is_claimed_twice(store: &dyn Store) {
+pub(in crate::store) async fn no_delivery_is_claimed_twice(store: &Store) {
     for job in 0..10 {
         ended(store, &format!("job-{job}"), URL, 1).await;
     }
@@ -170,7 +170,7 @@ pub(in crate::store) async fn no_delivery_is_claimed_twice(store: &dyn Store) {
     assert_eq!(claim_webhook(store, 2).await, None);
 }
 
-pub(in crate::store) async fn a_deleted_job_takes_its_webhook_along(store: &dyn Store) {
+pub(in crate::store) async fn a_deleted_job_takes_its_webhook_along(store: &Store) {
     let name = ended(store, "a", URL, 1).await;
     let job = claim_webhook(store, 1).await.expect("due");
     let etag = job.etag();

@@ -5,7 +5,6 @@ use std::time::Duration;
 use sqlx::postgres::{PgConnectOptions, PgListener, PgNotification, PgPool, PgPoolOptions};
 
 use crate::domain::job::JobName;
-use crate::store::sql::Change;
 use crate::store::{Error, Notification};
 
 /// Pause before the next try to listen, while the database is away; polls go on meanwhile.
@@ -18,12 +17,13 @@ const EVENTS: &str = "scpsfm_events";
 const QUEUED: &str = "scpsfm_queued";
 const CANCEL: &str = "scpsfm_cancel";
 
-/// The channel that notifies of a change; the payload is the job's name.
-pub(super) fn channel(change: Change) -> &'static str {
-    match change {
-        Change::Events => EVENTS,
-        Change::Queued => QUEUED,
-        Change::Cancel => CANCEL,
+/// The channel of a notification, and its payload: the job's name, where it is of one. `None`: nobody sends it.
+pub(super) fn message(notification: &Notification) -> Option<(&'static str, String)> {
+    match notification {
+        Notification::Events(job) => Some((EVENTS, job.to_string())),
+        Notification::Queued => Some((QUEUED, String::new())),
+        Notification::Cancel(job) => Some((CANCEL, job.to_string())),
+        Notification::Missed => None,
     }
 }
 

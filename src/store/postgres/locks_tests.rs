@@ -6,10 +6,11 @@ use futures_util::future::join_all;
 
 use super::tests::Fixture;
 use super::*;
+use crate::domain::job::JobName;
 use crate::store::contract::uploads::{ROOMY, finished, name, new};
 use crate::store::contract::{ROOM, record, time};
 use crate::store::record::{JobInput, NewRecord, Prefetch, TenantShares};
-use crate::store::{BegunUpload, Claim, Store};
+use crate::store::{BegunUpload, Claim};
 
 /// Enough for orders of locks that differ to meet: without the one order, each of these tests fails within a few.
 const ROUNDS: u32 = 40;
@@ -89,7 +90,7 @@ async fn of_an_input_that_loses_its_name_and_its_last_job_at_once_nothing_is_lef
         assert!(removed.iter().chain([&deleted]).all(Result::is_ok), "round {round}: {removed:?} {deleted:?}");
         let left = Statement::new("SELECT COUNT(*) AS count FROM inputs");
         let rows = fixture.reader(Size::Small).await.expect("a connection").rows(left).await.expect("counts");
-        assert_eq!(sql::Row::integer(&rows[0], "count"), Ok(0), "round {round}");
+        assert_eq!(rows[0].integer("count"), Ok(0), "round {round}");
     }
 }
 

@@ -13,15 +13,13 @@ mod url;
 
 use std::time::{Duration, SystemTime};
 
-use sqlx::pool::PoolConnection;
-use sqlx::postgres::{PgConnectOptions, PgConnection, PgPool, PgPoolOptions, PgRow};
+use sqlx::postgres::{PgConnectOptions, PgConnection, PgPool, PgPoolOptions};
 use tokio::sync::Mutex;
 use tokio::time::{Instant, timeout};
 
 use super::clock::LeaseClock;
-use super::sql::{self, Change, Connection, Database, Lock, Operation, Row, Size, Statement, WriteIntent};
+use super::sql::{self, Connection, Database, Lock, Operation, Row, Size, Statement, WriteIntent};
 use super::{Clock, Error, Notification};
-use crate::domain::job::JobName;
 use listener::Listener;
 pub use url::{DatabaseUrl, UrlError};
 
@@ -129,13 +127,13 @@ fn pool_of(connections: u32) -> PgPoolOptions {
         })
 }
 
+#[async_trait::async_trait]
 impl Connection for PgConnection {
-    type Row = PgRow;
-    const FOR_UPDATE: &'static str = " FOR UPDATE";
-    const SKIP_LOCKED: &'static str = " FOR UPDATE SKIP LOCKED";
-    const WRITES_ALONE: bool = false;
+    fn writes_alone(&self) -> bool {
+        false
+    }
 
-    async fn rows(&mut self, statement: Statement) -> Result<Vec<PgRow>, Error> {
+    async fn rows(&mut self, statement: Statement) -> Result<Vec<Row>, Error> {
         sql::run::<sqlx::Postgres>(self, statement).await
     }
 
@@ -144,35 +142,36 @@ impl Connection for PgConnection {
             Lock::Admission => ADMISSION_LOCK,
             Lock::Claims => CLAIMS_LOCK,
         };
-        self.execute(Statement::new("SELECT pg_advisory_xact_lock($1)").bind(key)).await
+        self.rows(Statement::new("SELECT pg_advisory_xact_lock($1)").bind(key)).await.map(drop)
     }
 
-    async fn notify(&mut self, change: Change, job: &JobName) -> Result<(), Error> {
-        let notify = Statement::new("SELECT pg_notify($1, $2)").bind(listener::channel(change));
-        self.execute(notify.bind(&job.to_string())).await
+    async fn notify(&mut self, notification: Notification) -> Result<(), Error> {
+        let Some((channel, payload)) = listener::message(&notification) else { return Ok(()) };
+        let notify = Statement::new("SELECT pg_notify($1, $2)").bind(channel).bind(&payload);
+        self.rows(notify).await.map(drop)
     }
 }
 
+#[async_trait::async_trait]
 impl Database for Postgres {
-    type Writing = PgConnection;
-    type Reading = PoolConnection<sqlx::Postgres>;
-
-    const SHARED: bool = true;
-
-    async fn reader(&self, size: Size) -> Result<PoolConnection<sqlx::Postgres>, Error> {
-        Ok(self.pool(size).acquire().await?)
+    fn is_shared(&self) -> bool {
+        true
     }
 
-    async fn write<T: Send + 'static>(
+    async fn reader(&self, size: Size) -> Result<Box<dyn Connection>, Error> {
+        Ok(Box::new(self.pool(size).acquire().await?))
+    }
+
+    async fn write(
         &self,
         size: Size,
         _intent: WriteIntent,
-        operation: Operation<PgConnection, T>,
-    ) -> Result<T, Error> {
+        operation: Operation<dyn Connection, ()>,
+    ) -> Result<(), Error> {
         let mut transaction = self.pool(size).begin().await?;
-        let outcome = operation(&mut transaction).await;
+        let outcome = operation(&mut *transaction).await;
         match outcome {
-            Ok(_) => transaction.commit().await?,
+            Ok(()) => transaction.commit().await?,
             // Dropped, it would be rolled back some time later: until then its locks hide rows from those who pass over
             // what is locked. Where it fails, the connection is gone, and they with it.
             Err(_) => drop(transaction.rollback().await),
@@ -193,7 +192,7 @@ impl Database for Postgres {
 
     async fn set_lease_clock(&self) -> Result<(), Error> {
         let select = Statement::new("SELECT CAST(EXTRACT(EPOCH FROM clock_timestamp()) * 1000000 AS BIGINT) AS micros");
-        let mut connection = self.pool.acquire().await?;
+        let mut connection = self.reader(Size::Small).await?;
         let asked = Instant::now();
         let theirs = connection.row(select).await?.integer("micros")?;
         self.clock.follow(theirs, asked);
@@ -206,7 +205,7 @@ impl Database for Postgres {
         Ok(u64::try_from(row.integer("bytes")?).unwrap_or(0))
     }
 
-    async fn next_notification(&self) -> Notification {
+    async fn notification(&self) -> Notification {
         #[cfg(test)]
         if self.deaf {
             return std::future::pending().await;

@@ -80,7 +80,7 @@ async fn bound_locks(connection: &mut PgConnection, bound: Duration) -> Result<(
     // 0 would be no bound.
     let milliseconds = bound.as_millis().max(1).to_string();
     let set = Statement::new("SELECT set_config('lock_timeout', $1, FALSE)").bind(&milliseconds);
-    Connection::execute(connection, set).await
+    connection.rows(set).await.map(drop)
 }
 
 fn is_late(error: &sqlx::migrate::MigrateError) -> bool {
@@ -94,7 +94,6 @@ mod tests {
     use super::super::tests::cluster;
     use super::super::url::DatabaseUrl;
     use super::*;
-    use crate::store::sql::Row;
 
     /// How a server that holds its statements to a bound reaches a database without a schema.
     async fn hasty(cluster: &cluster::Cluster) -> PgConnectOptions {
@@ -134,7 +133,7 @@ mod tests {
             let waiters = "SELECT COUNT(*) AS count FROM pg_locks WHERE locktype = 'advisory' AND NOT granted \
                            AND database = (SELECT oid FROM pg_database WHERE datname = current_database())";
             let look = async {
-                while other.row(Statement::new(waiters)).await.expect("counts").integer("count") != Ok(1) {
+                while other.rows(Statement::new(waiters)).await.expect("counts")[0].integer("count") != Ok(1) {
                     tokio::time::sleep(Duration::from_millis(10)).await;
                 }
             };

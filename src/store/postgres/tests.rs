@@ -8,9 +8,8 @@ use std::ops::Deref;
 use std::sync::Arc;
 
 use super::*;
-use crate::domain::job::JobState;
-use crate::store::sql::Row;
-use crate::store::{Claim, Store, contract};
+use crate::domain::job::{JobName, JobState};
+use crate::store::{Claim, contract};
 use cluster::Cluster;
 
 /// A store in a database of its own, in a cluster that lives as long as a test needs it.

@@ -7,27 +7,26 @@ use std::time::SystemTime;
 use super::jobs::{self, AdmissionStats};
 use super::removal::check_etag;
 use super::rows::{self, Transition, locked_job, micros, number, returning_job};
-use super::{Change, Connection, Lock, Row, Statement, webhooks};
+use super::{Connection, Lock, Statement, webhooks};
 use crate::domain::job::{Job, JobName, JobState};
-use crate::store::Error;
-use crate::store::QueueBounds;
-use crate::store::record::{QueueReport, QueueStats, RetryReply, TenantQueue};
+use crate::store::record::{Changed, QueueReport, QueueStats, TenantQueue};
+use crate::store::{Error, Notification, QueueBounds};
 
 /// Puts a job that ended without a result into the queue again; see [`crate::store::Store::retry_job`].
-pub(super) async fn retry<C: Connection>(
-    connection: &mut C,
+pub(super) async fn retry(
+    connection: &mut dyn Connection,
     name: &JobName,
     etag: Option<&str>,
     bounds: &QueueBounds,
     now: SystemTime,
-) -> Result<RetryReply, Error> {
+) -> Result<Changed, Error> {
     // Before the job's row, as whoever creates jobs takes them: two in the other order would wait for each other.
     connection.take_lock(Lock::Admission).await?;
     let job = locked_job(connection, name).await?;
     check_etag(connection, name, etag).await?;
     match job.state {
         JobState::Queued | JobState::Running => {
-            return Ok(RetryReply { job: jobs::get(connection, name).await?, queued_now: false });
+            return Ok(Changed { job: jobs::get(connection, name).await?, by_this_call: false });
         }
         JobState::Succeeded => return Err(Error::Succeeded(name.clone())),
         JobState::Failed | JobState::Cancelled | JobState::DeadlineExceeded => {}
@@ -49,12 +48,12 @@ pub(super) async fn retry<C: Connection>(
     connection.execute(anew.bind(micros(now)).bind(job.id)).await?;
     webhooks::renew(connection, job.id).await?;
     let job = rows::transition(connection, &job, Transition::to(JobState::Queued), now).await?;
-    Ok(RetryReply { job, queued_now: true })
+    Ok(Changed { job, by_this_call: true })
 }
 
 /// Changes the priority of a queued job.
-pub(super) async fn set_priority<C: Connection>(
-    connection: &mut C,
+pub(super) async fn set_priority(
+    connection: &mut dyn Connection,
     name: &JobName,
     etag: Option<&str>,
     priority: i32,
@@ -69,22 +68,17 @@ pub(super) async fn set_priority<C: Connection>(
 }
 
 /// Pauses or resumes the queue.
-pub(super) async fn set_paused<C: Connection>(connection: &mut C, paused: bool, now: SystemTime) -> Result<(), Error> {
+pub(super) async fn set_paused(connection: &mut dyn Connection, paused: bool, now: SystemTime) -> Result<(), Error> {
     if paused {
         let pause = Statement::new("UPDATE queue SET pause_time = COALESCE(pause_time, $1)").bind(micros(now));
         return connection.execute(pause).await;
     }
     connection.execute(Statement::new("UPDATE queue SET pause_time = NULL")).await?;
-    // Only where a job waits is there anything to tell of.
-    let waiting = Statement::new("SELECT tenant, job FROM jobs WHERE state = 'QUEUED' LIMIT 1");
-    match connection.optional_row(waiting).await? {
-        Some(row) => connection.notify(Change::Queued, &rows::name(&row)?).await,
-        None => Ok(()),
-    }
+    connection.notify(Notification::Queued).await
 }
 
 /// The queue as its administrator sees it.
-pub(super) async fn queue<C: Connection>(connection: &mut C, tenants: u32) -> Result<QueueReport, Error> {
+pub(super) async fn queue(connection: &mut dyn Connection, tenants: u32) -> Result<QueueReport, Error> {
     let pause = connection.row(Statement::new("SELECT pause_time FROM queue")).await?;
     // One look, so that the counts of tenants add up to those of all. Each half is answered by an index alone.
     let counts = Statement::new(

@@ -6,19 +6,19 @@ use super::rows::{
     self, LockedJob, Transition, end_attempt, held, insert_event, integer, locked_job, micros, number,
     select_locked_job,
 };
-use super::{Change, Connection, Row, Statement, jobs, removal};
+use super::{Connection, Row, Statement, jobs, removal};
 use crate::domain::job::{AttemptEnd, EventBody, Failure, Job, JobName, JobState, PastAttempt};
 use crate::domain::progress::Progress;
-use crate::store::record::{CancelReply, Ending, Heartbeat, Lease, Outcome};
-use crate::store::{ATTEMPTS_EXHAUSTED, Error, payload};
+use crate::store::record::{Changed, Ending, Heartbeat, Lease, Outcome};
+use crate::store::{ATTEMPTS_EXHAUSTED, Error, Notification, payload};
 
 /// Attempts that a failure tells of, the latest ones: those given back at a drain do not count against the cap, and
 /// there is no bound on them.
 const MOST_PAST_ATTEMPTS: u32 = 16;
 
 /// Extends a lease until `expires`.
-pub(super) async fn heartbeat<C: Connection>(
-    connection: &mut C,
+pub(super) async fn heartbeat(
+    connection: &mut dyn Connection,
     lease: &Lease,
     expires: SystemTime,
 ) -> Result<Heartbeat, Error> {
@@ -29,8 +29,8 @@ pub(super) async fn heartbeat<C: Connection>(
 }
 
 /// Appends a progress event.
-pub(super) async fn record<C: Connection>(
-    connection: &mut C,
+pub(super) async fn record(
+    connection: &mut dyn Connection,
     lease: &Lease,
     progress: &Progress,
     now: SystemTime,
@@ -43,13 +43,13 @@ pub(super) async fn record<C: Connection>(
         .bind(job.id);
     let event = insert_event(job.id, sequence, job.attempt, &EventBody::Progress(*progress), now)?;
     connection.batch(vec![update, event]).await?;
-    connection.notify(Change::Events, &job.name).await?;
+    connection.notify(Notification::Events(job.name.clone())).await?;
     Ok(sequence)
 }
 
 /// Ends an attempt and its job.
-pub(super) async fn finish<C: Connection>(
-    connection: &mut C,
+pub(super) async fn finish(
+    connection: &mut dyn Connection,
     lease: &Lease,
     ending: &Ending,
     now: SystemTime,
@@ -84,7 +84,7 @@ fn result_chunks(id: i64, bytes: &[u8]) -> impl Iterator<Item = Statement> + Sen
 }
 
 /// Gives a lease back.
-pub(super) async fn release<C: Connection>(connection: &mut C, lease: &Lease, now: SystemTime) -> Result<Job, Error> {
+pub(super) async fn release(connection: &mut dyn Connection, lease: &Lease, now: SystemTime) -> Result<Job, Error> {
     let job = held(connection, lease).await?;
     let next = if job.cancel_requested { JobState::Cancelled } else { JobState::Queued };
     let transition = Transition { attempt_end: Some(AttemptEnd::GivenBack), ..Transition::to(next) };
@@ -92,12 +92,12 @@ pub(super) async fn release<C: Connection>(connection: &mut C, lease: &Lease, no
 }
 
 /// Asks for the end of a job.
-pub(super) async fn request_cancel<C: Connection>(
-    connection: &mut C,
+pub(super) async fn request_cancel(
+    connection: &mut dyn Connection,
     name: &JobName,
     etag: Option<&str>,
     now: SystemTime,
-) -> Result<CancelReply, Error> {
+) -> Result<Changed, Error> {
     let job = locked_job(connection, name).await?;
     removal::check_etag(connection, name, etag).await?;
     let ended_now = job.state == JobState::Queued;
@@ -107,21 +107,21 @@ pub(super) async fn request_cancel<C: Connection>(
         connection
             .execute(Statement::new("UPDATE jobs SET cancel_requested = TRUE WHERE id = $1").bind(job.id))
             .await?;
-        connection.notify(Change::Cancel, name).await?;
+        connection.notify(Notification::Cancel(name.clone())).await?;
     }
-    Ok(CancelReply { job: jobs::get(connection, name).await?, ended_now })
+    Ok(Changed { job: jobs::get(connection, name).await?, by_this_call: ended_now })
 }
 
 /// Takes back the leases that ran out at `expired_at`, or all of them.
-pub(super) async fn take_back<C: Connection>(
-    connection: &mut C,
+pub(super) async fn take_back(
+    connection: &mut dyn Connection,
     expired_at: Option<SystemTime>,
     now: SystemTime,
     max_attempts: u32,
 ) -> Result<Vec<Job>, Error> {
     let select = Statement::new(select_locked_job!("WHERE state = 'RUNNING' AND lease_expires <= $1 ORDER BY id"))
         .bind(expired_at.map_or(i64::MAX, micros))
-        .then(C::SKIP_LOCKED);
+        .then(connection.skip_locked());
     if expired_at.is_none() {
         // Nor is anything prefetched that a process of before had leased.
         let free = "UPDATE jobs SET lease_worker = NULL, lease_expires = NULL \
@@ -160,8 +160,8 @@ fn after_loss(job: &LockedJob, lost_attempts: u32, now: SystemTime, max_attempts
 }
 
 /// Why a job failed that lost too many attempts, and what became of each.
-async fn exhausted<C: Connection>(
-    connection: &mut C,
+async fn exhausted(
+    connection: &mut dyn Connection,
     job: &LockedJob,
     lost_attempts: u32,
     max_attempts: u32,
@@ -171,7 +171,7 @@ async fn exhausted<C: Connection>(
          ORDER BY attempt DESC LIMIT $2",
     );
     let rows = connection.rows(select.bind(job.id).bind(MOST_PAST_ATTEMPTS)).await?;
-    let past = |row: &C::Row| {
+    let past = |row: &Row| {
         let ending = row.optional_text("ending")?.unwrap_or_default();
         Ok(PastAttempt {
             attempt: number(row, "attempt")?,
@@ -196,8 +196,8 @@ async fn exhausted<C: Connection>(
 }
 
 /// Whether a sweep would find anything: leases that ran out at `expired_at`, or deadlines that have passed.
-pub(super) async fn needs_sweep<C: Connection>(
-    connection: &mut C,
+pub(super) async fn needs_sweep(
+    connection: &mut dyn Connection,
     expired_at: SystemTime,
     now: SystemTime,
 ) -> Result<bool, Error> {
@@ -210,12 +210,12 @@ pub(super) async fn needs_sweep<C: Connection>(
 
 /// Ends queued jobs that are past their deadline, at most a hundred: the next sweep, a second later, takes the others,
 /// and none takes longer than an operation may.
-pub(super) async fn expire_queued<C: Connection>(connection: &mut C, now: SystemTime) -> Result<Vec<Job>, Error> {
+pub(super) async fn expire_queued(connection: &mut dyn Connection, now: SystemTime) -> Result<Vec<Job>, Error> {
     let select = Statement::new(select_locked_job!(
         "WHERE state = 'QUEUED' AND deadline IS NOT NULL AND deadline <= $1 ORDER BY id LIMIT 100"
     ))
     .bind(micros(now))
-    .then(C::SKIP_LOCKED);
+    .then(connection.skip_locked());
     let mut changed = Vec::new();
     for row in connection.rows(select).await? {
         let job = LockedJob::from_row(&row)?;

@@ -9,13 +9,13 @@
 use std::time::SystemTime;
 
 use super::rows::{self, LockedJob, insert_event, integer, micros, returning_job, select_locked_job};
-use super::{Change, Connection, Lock, Row, Statement, fairness};
+use super::{Connection, Lock, Row, Statement, fairness};
 use crate::domain::job::{EventBody, JobState};
-use crate::store::Error;
 use crate::store::record::{Claim, Claimed, Claims, Lease, Prefetch};
+use crate::store::{Error, Notification};
 
 /// Whether anything is queued that may be begun.
-pub(super) async fn may_claim<C: Connection>(connection: &mut C) -> Result<bool, Error> {
+pub(super) async fn may_claim(connection: &mut dyn Connection) -> Result<bool, Error> {
     let select = Statement::new(
         "SELECT EXISTS (SELECT 1 FROM jobs WHERE state = 'QUEUED' AND (SELECT pause_time FROM queue) IS NULL) AS found",
     );
@@ -25,8 +25,8 @@ pub(super) async fn may_claim<C: Connection>(connection: &mut C) -> Result<bool,
 /// See [`crate::store::Store::claim`].
 ///
 /// * `lease_now`: now, on the clock of leases
-pub(super) async fn claim<C: Connection>(
-    connection: &mut C,
+pub(super) async fn claim(
+    connection: &mut dyn Connection,
     claim: &Claim,
     now: SystemTime,
     lease_now: SystemTime,
@@ -64,8 +64,8 @@ fn is_suspect(claim: &Claim, job: &LockedJob) -> bool {
 
 /// The job whose turn it is among those that nobody has a lease on, counted for its tenant; none where it is not
 /// `wanted`.
-async fn next<C: Connection>(
-    connection: &mut C,
+async fn next(
+    connection: &mut dyn Connection,
     claim: &Claim,
     wanted: impl Fn(&LockedJob) -> bool,
     now: SystemTime,
@@ -79,13 +79,13 @@ async fn next<C: Connection>(
         .bind(&tenant)
         .bind(micros(now))
         .bind(micros(lease_now))
-        .then(C::SKIP_LOCKED);
+        .then(connection.skip_locked());
         if let Some(row) = connection.optional_row(first).await? {
             let job = LockedJob::from_row(&row)?;
             if !wanted(&job) {
                 break;
             }
-            connection.execute(fairness::count::<C>(&claim.shares, &tenant)).await?;
+            fairness::count(connection, &claim.shares, &tenant).await?;
             return Ok(Some(job));
         }
     }
@@ -93,8 +93,8 @@ async fn next<C: Connection>(
 }
 
 /// The job that an earlier claim of this worker prefetched, if nobody else has leased it since.
-async fn prefetched<C: Connection>(
-    connection: &mut C,
+async fn prefetched(
+    connection: &mut dyn Connection,
     claim: &Claim,
     lease: &Lease,
     created: SystemTime,
@@ -115,14 +115,14 @@ async fn prefetched<C: Connection>(
     .bind(micros(now))
     .bind(&claim.worker)
     .bind(expires_after)
-    .then(C::FOR_UPDATE);
+    .then(connection.for_update());
     connection.optional_row(same).await?.as_ref().map(LockedJob::from_row).transpose()
 }
 
 /// The job that an earlier claim of this process has begun, where the answer was lost: its lease is extended. Of a
 /// process in which nothing else runs; in another one a worker has it.
-async fn begun_before<C: Connection>(
-    connection: &mut C,
+async fn begun_before(
+    connection: &mut dyn Connection,
     claim: &Claim,
     lease_now: SystemTime,
 ) -> Result<Option<Claimed>, Error> {
@@ -142,8 +142,8 @@ async fn begun_before<C: Connection>(
 
 /// A job that any worker has prefetched: it would wait for that worker, and this one is idle. There are as many as
 /// workers at most, and their tenants' turns have come. A suspect stays with the process that waits to be idle.
-async fn prefetched_by_any<C: Connection>(
-    connection: &mut C,
+async fn prefetched_by_any(
+    connection: &mut dyn Connection,
     claim: &Claim,
     now: SystemTime,
     lease_now: SystemTime,
@@ -156,13 +156,13 @@ async fn prefetched_by_any<C: Connection>(
     .bind(micros(lease_now))
     .bind(micros(now))
     .bind(claim.suspect_after.map_or(i64::MAX, i64::from))
-    .then(C::SKIP_LOCKED);
+    .then(connection.skip_locked());
     connection.optional_row(first).await?.as_ref().map(LockedJob::from_row).transpose()
 }
 
 /// Begins an attempt at a queued job.
-async fn begin<C: Connection>(
-    connection: &mut C,
+async fn begin(
+    connection: &mut dyn Connection,
     claim: &Claim,
     job: &LockedJob,
     now: SystemTime,
@@ -187,14 +187,14 @@ async fn begin<C: Connection>(
     let event = EventBody::State { state: JobState::Running, failure: None };
     let event = insert_event(job.id, sequence, attempt, &event, now)?;
     let rows = connection.batch(vec![lease, begin, event]).await?;
-    connection.notify(Change::Events, &job.name).await?;
+    connection.notify(Notification::Events(job.name.clone())).await?;
     let changed = rows.first().ok_or_else(|| Error::Corrupt("a job that was just leased is not there".into()))?;
     claimed(changed, 0)
 }
 
 /// Leases the next job without a word to anyone: it is not begun.
-async fn prefetch<C: Connection>(
-    connection: &mut C,
+async fn prefetch(
+    connection: &mut dyn Connection,
     claim: &Claim,
     terms: Prefetch,
     now: SystemTime,
@@ -206,8 +206,8 @@ async fn prefetch<C: Connection>(
 }
 
 /// Leases a queued job that is not begun.
-async fn lease<C: Connection>(
-    connection: &mut C,
+async fn lease(
+    connection: &mut dyn Connection,
     claim: &Claim,
     job: &LockedJob,
     expires: SystemTime,
@@ -220,7 +220,7 @@ async fn lease<C: Connection>(
 }
 
 /// A job with its lease, from a row of all its columns. `earlier`: attempts that are to be begun before the lease's.
-fn claimed(row: &impl Row, earlier: u32) -> Result<Claimed, Error> {
+fn claimed(row: &Row, earlier: u32) -> Result<Claimed, Error> {
     let job = rows::job(row)?;
     Ok(Claimed {
         lease: Lease { name: job.name.clone(), attempt: job.attempt + earlier },

@@ -14,7 +14,7 @@ use std::collections::HashSet;
 use std::time::SystemTime;
 
 use super::rows::micros;
-use super::{Connection, Row, Statement};
+use super::{Connection, Statement};
 use crate::store::Error;
 use crate::store::record::{Claim, Lease, TenantShares};
 
@@ -26,7 +26,7 @@ fn step(shares: &TenantShares, tenant: &str) -> i64 {
 }
 
 /// Notes a tenant that has a job. By one transaction at a time: who admits jobs has the lock.
-pub(super) async fn register<C: Connection>(connection: &mut C, tenant: &str) -> Result<(), Error> {
+pub(super) async fn register(connection: &mut dyn Connection, tenant: &str) -> Result<(), Error> {
     let insert = "INSERT INTO tenants (tenant) SELECT $1 WHERE NOT EXISTS (SELECT 1 FROM tenants WHERE tenant = $1)";
     connection.execute(Statement::new(insert).bind(tenant)).await
 }
@@ -34,8 +34,8 @@ pub(super) async fn register<C: Connection>(connection: &mut C, tenant: &str) ->
 /// Tenants that have jobs waiting and may begin one, in the order of their turns; none while the queue is paused.
 ///
 /// * `lease_now`: now, on the clock of leases
-pub(super) async fn turns<C: Connection>(
-    connection: &mut C,
+pub(super) async fn turns(
+    connection: &mut dyn Connection,
     claim: &Claim,
     lease_now: SystemTime,
 ) -> Result<Vec<String>, Error> {
@@ -64,11 +64,7 @@ pub(super) async fn turns<C: Connection>(
 }
 
 /// Tenants with as many jobs running or prefetched as may run at once.
-async fn full<C: Connection>(
-    connection: &mut C,
-    claim: &Claim,
-    lease_now: SystemTime,
-) -> Result<HashSet<String>, Error> {
+async fn full(connection: &mut dyn Connection, claim: &Claim, lease_now: SystemTime) -> Result<HashSet<String>, Error> {
     let Some(max_running) = claim.shares.max_running else { return Ok(HashSet::new()) };
     let mut select = Statement::new(
         "SELECT tenant FROM ( \
@@ -86,8 +82,8 @@ async fn full<C: Connection>(
 }
 
 /// Counts a turn of a tenant, unless another transaction is counting one of it.
-pub(super) fn count<C: Connection>(shares: &TenantShares, tenant: &str) -> Statement {
-    Statement::new(
+pub(super) async fn count(connection: &mut dyn Connection, shares: &TenantShares, tenant: &str) -> Result<(), Error> {
+    let update = Statement::new(
         "UPDATE tenants SET virtual_start = CASE \
              WHEN virtual_start + $1 > (SELECT MAX(virtual_start) FROM tenants) THEN virtual_start + $1 \
              ELSE (SELECT MAX(virtual_start) FROM tenants) END \
@@ -95,6 +91,7 @@ pub(super) fn count<C: Connection>(shares: &TenantShares, tenant: &str) -> State
     )
     .bind(step(shares, tenant))
     .bind(tenant)
-    .then(C::SKIP_LOCKED)
-    .then(")")
+    .then(connection.skip_locked())
+    .then(")");
+    connection.execute(update).await
 }

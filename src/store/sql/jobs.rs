@@ -4,26 +4,27 @@ use std::collections::{BTreeSet, HashMap, HashSet};
 use std::time::SystemTime;
 
 use super::rows::{self, integer, micros, number, returning_job, select_jobs};
-use super::{Change, Connection, Lock, Row, Statement, fairness, uploads, webhooks};
+use super::{Connection, Lock, Row, Statement, fairness, uploads, webhooks};
 use crate::domain::job::{EventBody, Job, JobEvent, JobName, JobState};
 use crate::domain::{InputName, Webhook};
-use crate::store::record::{Created, EncodedResult, JobInput, JobPayload, NewRecord, QueueStats, Request, TenantQueue};
-use crate::store::{Error, JobPage, JobQuery, Order, QueueBounds, TakenId, payload};
+use crate::store::query::Paged;
+use crate::store::record::{Changed, EncodedResult, JobInput, JobPayload, NewRecord, QueueStats, Request, TenantQueue};
+use crate::store::{Error, JobQuery, Notification, Order, Page, QueueBounds, TakenId, payload};
 
 /// Number of a job's first event, which its row counts.
 const FIRST_EVENT: u64 = 1;
 
 /// Stores jobs, all or none; see [`crate::store::Store::create_jobs`].
-pub(super) async fn create<C: Connection>(
-    connection: &mut C,
+pub(super) async fn create(
+    connection: &mut dyn Connection,
     news: &[NewRecord],
     bounds: &QueueBounds,
     now: SystemTime,
-) -> Result<Vec<Created>, Error> {
+) -> Result<Vec<Changed>, Error> {
     check_size(connection, news, bounds).await?;
     let mut stats = AdmissionStats::default();
     let mut inputs = vec![None; news.len()];
-    if !C::WRITES_ALONE {
+    if !connection.writes_alone() {
         // Before anything else, and each name once: two batches of the same inputs in other orders would wait for each
         // other.
         uploads::lock(connection, &news.iter().filter_map(uploaded).collect()).await?;
@@ -47,20 +48,23 @@ pub(super) async fn create<C: Connection>(
                     let delete = Statement::new("DELETE FROM inputs WHERE id = $1 AND input IS NULL");
                     connection.execute(delete.bind(input)).await?;
                 }
-                created.push(Created { job: attach(connection, job, new.cancel_on_disconnect).await?, new: false });
+                created.push(Changed {
+                    job: attach(connection, job, new.cancel_on_disconnect).await?,
+                    by_this_call: false,
+                });
             }
             None => {
                 let input = match input {
                     Some(input) => input,
                     None => input_of(connection, new, now).await?,
                 };
-                created.push(Created { job: enqueue(connection, new, input, now).await?, new: true });
+                created.push(Changed { job: enqueue(connection, new, input, now).await?, by_this_call: true });
                 stats.add(new);
                 stored.push(new);
             }
         }
     }
-    let fresh = created.iter().filter(|created| created.new).map(|created| created.job.name.tenant.as_str());
+    let fresh = created.iter().filter(|created| created.by_this_call).map(|created| created.job.name.tenant.as_str());
     for tenant in fresh.collect::<BTreeSet<_>>() {
         fairness::register(connection, tenant).await?;
     }
@@ -76,7 +80,7 @@ fn of_batch(error: Error, stored: &[&NewRecord], rest: &[NewRecord]) -> Error {
 }
 
 /// Refuses jobs that are more by themselves than may ever wait: told to come back, their caller would do so for ever.
-async fn check_size<C: Connection>(connection: &mut C, news: &[NewRecord], bounds: &QueueBounds) -> Result<(), Error> {
+async fn check_size(connection: &mut dyn Connection, news: &[NewRecord], bounds: &QueueBounds) -> Result<(), Error> {
     if bounds.never_takes(&news.iter().collect::<Vec<_>>()).is_none() {
         return Ok(());
     }
@@ -106,9 +110,9 @@ pub(super) struct AdmissionStats {
 
 impl AdmissionStats {
     /// What waits of all tenants, and of this one where it has bounds of its own.
-    pub(super) async fn look<C: Connection>(
+    pub(super) async fn look(
         &mut self,
-        connection: &mut C,
+        connection: &mut dyn Connection,
         tenant: &str,
         bounds: &QueueBounds,
     ) -> Result<(QueueStats, QueueStats), Error> {
@@ -137,8 +141,8 @@ impl AdmissionStats {
 }
 
 /// Stores a job that was admitted, its labels, its request id and its first event.
-async fn enqueue<C: Connection>(
-    connection: &mut C,
+async fn enqueue(
+    connection: &mut dyn Connection,
     new: &NewRecord,
     input_id: i64,
     now: SystemTime,
@@ -168,14 +172,14 @@ async fn enqueue<C: Connection>(
         connection.execute(webhooks::insert(id, &webhook)?).await?;
         job.webhook = Some(webhook);
     }
-    connection.notify(Change::Events, &new.name).await?;
-    connection.notify(Change::Queued, &new.name).await?;
+    connection.notify(Notification::Events(new.name.clone())).await?;
+    connection.notify(Notification::Queued).await?;
     Ok(job)
 }
 
 /// Whether a job may be stored: `Ok(None)`; or the job that the same request made before.
-async fn admit<C: Connection>(
-    connection: &mut C,
+async fn admit(
+    connection: &mut dyn Connection,
     new: &NewRecord,
     bounds: &QueueBounds,
     stats: &mut AdmissionStats,
@@ -199,8 +203,8 @@ async fn admit<C: Connection>(
 }
 
 /// The job that this request id made before.
-pub(super) async fn earlier<C: Connection>(
-    connection: &mut C,
+pub(super) async fn earlier(
+    connection: &mut dyn Connection,
     tenant: &str,
     request: &Request,
 ) -> Result<Option<Job>, Error> {
@@ -218,7 +222,7 @@ pub(super) async fn earlier<C: Connection>(
 
 /// What becomes of a job whose request came again: a call that is to cancel it on disconnect attaches, as far as the
 /// job depends on its calls at all; after any other one it depends on none.
-async fn attach<C: Connection>(connection: &mut C, job: Job, cancel_on_disconnect: bool) -> Result<Job, Error> {
+async fn attach(connection: &mut dyn Connection, job: Job, cancel_on_disconnect: bool) -> Result<Job, Error> {
     if job.attached_calls.is_none() || job.state.is_terminal() {
         return Ok(job);
     }
@@ -232,11 +236,7 @@ async fn attach<C: Connection>(connection: &mut C, job: Job, cancel_on_disconnec
 }
 
 /// One of the calls that a job depends on was disconnected; see [`crate::store::Store::detach`].
-pub(super) async fn detach<C: Connection>(
-    connection: &mut C,
-    name: &JobName,
-    created: SystemTime,
-) -> Result<Job, Error> {
+pub(super) async fn detach(connection: &mut dyn Connection, name: &JobName, created: SystemTime) -> Result<Job, Error> {
     let update = Statement::new(returning_job!(
         "UPDATE jobs SET detached_calls = detached_calls + 1 \
          WHERE tenant = $1 AND job = $2 AND create_time = $3 AND attached_calls > detached_calls"
@@ -249,7 +249,7 @@ pub(super) async fn detach<C: Connection>(
 }
 
 /// The row of a job's input: one that is stored now, or that of an uploaded one.
-async fn input_of<C: Connection>(connection: &mut C, new: &NewRecord, now: SystemTime) -> Result<i64, Error> {
+async fn input_of(connection: &mut dyn Connection, new: &NewRecord, now: SystemTime) -> Result<i64, Error> {
     match &new.input {
         JobInput::Inline(bytes) => insert_input(connection, &new.name.tenant, bytes, now).await,
         JobInput::Uploaded { input, .. } => uploads::use_input(connection, &named(new, input), now).await,
@@ -266,8 +266,8 @@ fn named(new: &NewRecord, input: &str) -> InputName {
 }
 
 /// Stores an encoded input; returns its row.
-pub(super) async fn insert_input<C: Connection>(
-    connection: &mut C,
+pub(super) async fn insert_input(
+    connection: &mut dyn Connection,
     tenant: &str,
     bytes: &[u8],
     now: SystemTime,
@@ -310,22 +310,14 @@ fn insert_job(new: &NewRecord, input_id: i64, now: SystemTime) -> Result<Stateme
 }
 
 /// One job by its name.
-pub(super) async fn get<C: Connection>(connection: &mut C, name: &JobName) -> Result<Job, Error> {
+pub(super) async fn get(connection: &mut dyn Connection, name: &JobName) -> Result<Job, Error> {
     let select = Statement::new(select_jobs!("WHERE tenant = $1 AND job = $2")).bind(&name.tenant).bind(&name.job);
     let row = connection.optional_row(select).await?;
     row.as_ref().map_or_else(|| Err(Error::NotFound(name.clone())), rows::job)
 }
 
 /// One page of a listing.
-pub(super) async fn list<C: Connection>(connection: &mut C, query: &JobQuery) -> Result<JobPage, Error> {
-    let size = query.effective_page_size();
-    let rows = connection.rows(listing(query, size)?).await?;
-    let (rows, next_page_token) = rows::page(rows, size, "job", |cursor| query.token_after(cursor))?;
-    Ok(JobPage { jobs: rows.iter().map(rows::job).collect::<Result<_, _>>()?, next_page_token })
-}
-
-/// The `SELECT` of a page of that size.
-fn listing(query: &JobQuery, size: u32) -> Result<Statement, Error> {
+pub(super) async fn list(connection: &mut dyn Connection, query: &JobQuery) -> Result<Page<Job>, Error> {
     let cursor = query.cursor()?;
     let mut select = Statement::new(select_jobs!("WHERE tenant = ")).then_bind(&query.tenant);
     for (number, state) in query.states.iter().enumerate() {
@@ -339,17 +331,17 @@ fn listing(query: &JobQuery, size: u32) -> Result<Statement, Error> {
         select = select.then(" AND value = ").then_bind(value).then(")");
     }
     let (beyond, order) = match query.order {
-        Order::CreateTimeDescending => (" AND (create_time, job) < (", " ORDER BY create_time DESC, job DESC LIMIT "),
-        Order::CreateTimeAscending => (" AND (create_time, job) > (", " ORDER BY create_time, job LIMIT "),
+        Order::CreateTimeDescending => (" AND (create_time, job) < (", " ORDER BY create_time DESC, job DESC"),
+        Order::CreateTimeAscending => (" AND (create_time, job) > (", " ORDER BY create_time, job"),
     };
     if let Some(cursor) = cursor {
         select = select.then(beyond).then_bind(cursor.create_micros).then(", ").then_bind(&cursor.id).then(")");
     }
-    Ok(select.then(order).then_bind(rows::limit(size)))
+    rows::page(connection, query, select.then(order), "job", rows::job).await
 }
 
 /// The row of a job.
-async fn id<C: Connection>(connection: &mut C, name: &JobName) -> Result<i64, Error> {
+async fn id(connection: &mut dyn Connection, name: &JobName) -> Result<i64, Error> {
     let select =
         Statement::new("SELECT id FROM jobs WHERE tenant = $1 AND job = $2").bind(&name.tenant).bind(&name.job);
     let row = connection.optional_row(select).await?;
@@ -357,8 +349,8 @@ async fn id<C: Connection>(connection: &mut C, name: &JobName) -> Result<i64, Er
 }
 
 /// Events of a job with a sequence number above `after`.
-pub(super) async fn events_after<C: Connection>(
-    connection: &mut C,
+pub(super) async fn events_after(
+    connection: &mut dyn Connection,
     name: &JobName,
     after: u64,
     limit: u32,
@@ -372,13 +364,13 @@ pub(super) async fn events_after<C: Connection>(
     .bind(&name.job)
     .bind(integer(after))
     .bind(limit);
-    let event = |row: &C::Row| {
+    let event = |row: &Row| {
         Ok(JobEvent {
             job: name.clone(),
             attempt: number(row, "attempt")?,
             sequence: Some(number(row, "sequence")?),
             time: rows::time(row.integer("time")?),
-            body: payload::decode(&row.bytes("body")?, "an event")?,
+            body: payload::decode(row.bytes("body")?, "an event")?,
         })
     };
     let rows = connection.rows(select).await?;
@@ -390,7 +382,7 @@ pub(super) async fn events_after<C: Connection>(
 }
 
 /// The encoded input of a job, and whether its cancel was asked for.
-pub(super) async fn job_payload<C: Connection>(connection: &mut C, name: &JobName) -> Result<JobPayload, Error> {
+pub(super) async fn job_payload(connection: &mut dyn Connection, name: &JobName) -> Result<JobPayload, Error> {
     let select = Statement::new(
         "SELECT data, cancel_requested FROM jobs JOIN input_chunks ON input_chunks.input_id = jobs.input_id \
          WHERE tenant = $1 AND job = $2 ORDER BY chunk",
@@ -402,7 +394,7 @@ pub(super) async fn job_payload<C: Connection>(connection: &mut C, name: &JobNam
 }
 
 /// The encoded result of a job, if it has one.
-pub(super) async fn result<C: Connection>(connection: &mut C, name: &JobName) -> Result<Option<EncodedResult>, Error> {
+pub(super) async fn result(connection: &mut dyn Connection, name: &JobName) -> Result<Option<EncodedResult>, Error> {
     // In one look: between two the job may be deleted.
     let select = Statement::new(
         "SELECT result_sha256, data FROM jobs LEFT JOIN result_chunks ON result_chunks.job_id = jobs.id \
@@ -415,7 +407,7 @@ pub(super) async fn result<C: Connection>(connection: &mut C, name: &JobName) ->
     Ok(Some(EncodedResult { bytes: joined(&chunks)?, sha256 }))
 }
 
-pub(super) fn joined(chunks: &[impl Row]) -> Result<Vec<u8>, Error> {
+pub(super) fn joined(chunks: &[Row]) -> Result<Vec<u8>, Error> {
     let mut whole = Vec::new();
     for chunk in chunks {
         whole.extend(chunk.bytes("data")?);
@@ -424,7 +416,7 @@ pub(super) fn joined(chunks: &[impl Row]) -> Result<Vec<u8>, Error> {
 }
 
 /// What waits and what runs.
-pub(super) async fn queue_stats<C: Connection>(connection: &mut C) -> Result<QueueStats, Error> {
+pub(super) async fn queue_stats(connection: &mut dyn Connection) -> Result<QueueStats, Error> {
     // Sums of 64-bit numbers have a wider type of their own in PostgreSQL.
     let select = Statement::new(
         "SELECT COUNT(*) AS queued, CAST(COALESCE(SUM(input_bytes), 0) AS BIGINT) AS bytes, \
@@ -436,8 +428,8 @@ pub(super) async fn queue_stats<C: Connection>(connection: &mut C) -> Result<Que
 }
 
 /// What waits and runs of each tenant that has such jobs, and since when the oldest job waits.
-pub(super) async fn by_tenant<C: Connection>(
-    connection: &mut C,
+pub(super) async fn by_tenant(
+    connection: &mut dyn Connection,
 ) -> Result<(Vec<TenantQueue>, Option<SystemTime>), Error> {
     let select = Statement::new(
         "SELECT tenant, COUNT(*) FILTER (WHERE state = 'QUEUED') AS queued, \
@@ -457,7 +449,7 @@ pub(super) async fn by_tenant<C: Connection>(
 }
 
 /// What waits of one tenant; what runs is not counted.
-async fn tenant_queue_stats<C: Connection>(connection: &mut C, tenant: &str) -> Result<QueueStats, Error> {
+async fn tenant_queue_stats(connection: &mut dyn Connection, tenant: &str) -> Result<QueueStats, Error> {
     let select = Statement::new(
         "SELECT COUNT(*) AS queued, CAST(COALESCE(SUM(input_bytes), 0) AS BIGINT) AS bytes, \
          CAST(COALESCE(SUM(observation_count), 0) AS BIGINT) AS observations, CAST(0 AS BIGINT) AS running, \
@@ -466,7 +458,7 @@ async fn tenant_queue_stats<C: Connection>(connection: &mut C, tenant: &str) -> 
     measured(&connection.row(select.bind(tenant)).await?)
 }
 
-fn measured(row: &impl Row) -> Result<QueueStats, Error> {
+fn measured(row: &Row) -> Result<QueueStats, Error> {
     Ok(QueueStats {
         queued: number(row, "queued")?,
         queued_bytes: number(row, "bytes")?,

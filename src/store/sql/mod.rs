@@ -1,6 +1,6 @@
 //! What the SQL databases say in the same words: the statements, what their rows mean, and in which transaction what
 //! changes. A database adds how it is opened, its schema and the few words that are its own, through [`Connection`] and
-//! [`Database`]; whatever implements [`Database`] is a [`crate::store::Store`].
+//! [`Database`].
 
 mod admin;
 mod attempts;
@@ -14,125 +14,127 @@ mod store;
 mod uploads;
 mod webhooks;
 
-use std::future::Future;
-use std::ops::DerefMut;
 use std::time::{Duration, SystemTime};
 
 use futures_util::future::BoxFuture;
 use sqlx::SqlSafeStr;
 use sqlx::migrate::{Migration, MigrationType, Migrator};
+use sqlx::pool::PoolConnection;
 
 use super::{Error, Notification};
-use crate::domain::job::JobName;
 pub(super) use rows::{micros, time};
 pub(super) use statement::{Row, Statement, Value, run};
 
 /// A connection to a database, within a transaction or not: unless it says otherwise, one that has the database to
 /// itself when it writes.
-pub(super) trait Connection: Send {
-    type Row: Row;
-    /// Ends a `SELECT` whose rows the transaction is about to change.
-    const FOR_UPDATE: &'static str = "";
-    /// The same, passing over the rows that another transaction is changing.
-    const SKIP_LOCKED: &'static str = "";
+#[async_trait::async_trait]
+pub trait Connection: Send {
     /// Whether a transaction that writes is alone in the database: what it has seen stays as it is.
-    const WRITES_ALONE: bool = true;
+    fn writes_alone(&self) -> bool {
+        true
+    }
 
     /// Runs a statement to its end and returns its rows.
-    fn rows(&mut self, statement: Statement) -> impl Future<Output = Result<Vec<Self::Row>, Error>> + Send;
+    async fn rows(&mut self, statement: Statement) -> Result<Vec<Row>, Error>;
 
     /// Waits until no other transaction has the lock, and keeps it until this one ends.
-    fn take_lock(&mut self, _lock: Lock) -> impl Future<Output = Result<(), Error>> + Send {
-        std::future::ready(Ok(()))
+    async fn take_lock(&mut self, _lock: Lock) -> Result<(), Error> {
+        Ok(())
     }
 
     /// Notifies other processes of a change, once it is committed.
-    fn notify(&mut self, _change: Change, _job: &JobName) -> impl Future<Output = Result<(), Error>> + Send {
-        std::future::ready(Ok(()))
+    async fn notify(&mut self, _notification: Notification) -> Result<(), Error> {
+        Ok(())
+    }
+}
+
+impl dyn Connection + '_ {
+    /// Ends a `SELECT` whose rows the transaction is about to change.
+    fn for_update(&self) -> &'static str {
+        if self.writes_alone() { "" } else { " FOR UPDATE" }
+    }
+
+    /// The same, passing over the rows that another transaction is changing.
+    fn skip_locked(&self) -> &'static str {
+        if self.writes_alone() { "" } else { " FOR UPDATE SKIP LOCKED" }
     }
 
     /// The one row of a statement that always has one.
-    fn row(&mut self, statement: Statement) -> impl Future<Output = Result<Self::Row, Error>> + Send {
-        async {
-            let row = self.optional_row(statement).await?;
-            row.ok_or_else(|| Error::Corrupt("a row that was just written is not there".into()))
-        }
+    pub(super) async fn row(&mut self, statement: Statement) -> Result<Row, Error> {
+        let row = self.optional_row(statement).await?;
+        row.ok_or_else(|| Error::Corrupt("a row that was just written is not there".into()))
     }
 
     /// The first row, if there is any.
-    fn optional_row(&mut self, statement: Statement) -> impl Future<Output = Result<Option<Self::Row>, Error>> + Send {
-        async { Ok(self.rows(statement).await?.into_iter().next()) }
+    pub(super) async fn optional_row(&mut self, statement: Statement) -> Result<Option<Row>, Error> {
+        Ok(self.rows(statement).await?.into_iter().next())
     }
 
     /// Runs statements in their order, of which none needs another's answer. Returns the rows of all of them.
-    fn batch(&mut self, statements: Vec<Statement>) -> impl Future<Output = Result<Vec<Self::Row>, Error>> + Send {
-        async {
-            let mut rows = Vec::new();
-            for statement in statements {
-                rows.append(&mut self.rows(statement).await?);
-            }
-            Ok(rows)
+    async fn batch(&mut self, statements: Vec<Statement>) -> Result<Vec<Row>, Error> {
+        let mut rows = Vec::new();
+        for statement in statements {
+            rows.append(&mut self.rows(statement).await?);
         }
+        Ok(rows)
     }
 
     /// Runs a statement that has no rows.
-    fn execute(&mut self, statement: Statement) -> impl Future<Output = Result<(), Error>> + Send {
-        async { self.rows(statement).await.map(drop) }
+    pub(super) async fn execute(&mut self, statement: Statement) -> Result<(), Error> {
+        self.rows(statement).await.map(drop)
+    }
+}
+
+#[async_trait::async_trait]
+impl<D: sqlx::Database> Connection for PoolConnection<D>
+where
+    D::Connection: Connection,
+{
+    fn writes_alone(&self) -> bool {
+        (**self).writes_alone()
+    }
+
+    async fn rows(&mut self, statement: Statement) -> Result<Vec<Row>, Error> {
+        (**self).rows(statement).await
     }
 }
 
 /// What one transaction at a time may do, where writing is not that by itself.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(super) enum Lock {
+pub enum Lock {
     /// Admit jobs: the bounds of the queue hold over all servers.
     Admission,
     /// Claim jobs, where there is a bound on those of a tenant that run.
     Claims,
 }
 
-/// What other processes are notified of.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(super) enum Change {
-    /// It has new events.
-    Events,
-    /// It entered the queue.
-    Queued,
-    /// Its cancel was asked for.
-    Cancel,
-}
-
 /// What is one transaction. It may be run again where its transaction came to nothing.
-pub(super) type Operation<C, T> =
-    Box<dyn for<'c> Fn(&'c mut C) -> BoxFuture<'c, Result<T, Error>> + Send + Sync + 'static>;
+pub type Operation<C, T> = Box<dyn for<'c> Fn(&'c mut C) -> BoxFuture<'c, Result<T, Error>> + Send + Sync + 'static>;
 
 /// An operation from a closure.
-pub(super) fn operation<C, T>(
+pub(super) fn operation<C: ?Sized, T>(
     run: impl for<'c> Fn(&'c mut C) -> BoxFuture<'c, Result<T, Error>> + Send + Sync + 'static,
 ) -> Operation<C, T> {
     Box::new(run)
 }
 
-/// A database as a store uses it.
-pub(super) trait Database: Send + Sync + 'static {
-    /// A connection that writes.
-    type Writing: Connection;
-    /// A connection that only reads, lent.
-    type Reading: DerefMut<Target: Connection + Sized> + Send;
-
+/// What a store needs of its database; the store's operations are in `store`.
+#[async_trait::async_trait]
+pub trait Database: Send + Sync + 'static {
     /// Whether other processes may hold leases and change jobs.
-    const SHARED: bool;
+    fn is_shared(&self) -> bool;
 
     /// A connection that only reads.
-    fn reader(&self, size: Size) -> impl Future<Output = Result<Self::Reading, Error>> + Send;
+    async fn reader(&self, size: Size) -> Result<Box<dyn Connection>, Error>;
 
     /// Runs an operation in a transaction, and answers once it is committed and durable. Where it is refused, nothing
     /// of it is.
-    fn write<T: Send + 'static>(
+    async fn write(
         &self,
         size: Size,
         intent: WriteIntent,
-        operation: Operation<Self::Writing, T>,
-    ) -> impl Future<Output = Result<T, Error>> + Send;
+        operation: Operation<dyn Connection, ()>,
+    ) -> Result<(), Error>;
 
     /// How long an operation of this size may take; `None`: as long as it does.
     fn bound(&self, size: Size) -> Option<Duration>;
@@ -142,34 +144,37 @@ pub(super) trait Database: Send + Sync + 'static {
     fn lease_clock(&self, now: SystemTime) -> SystemTime;
 
     /// Compares the caller's clock with that of the leases; called again and again, as clocks drift.
-    fn set_lease_clock(&self) -> impl Future<Output = Result<(), Error>> + Send {
-        async { Ok(()) }
+    async fn set_lease_clock(&self) -> Result<(), Error> {
+        Ok(())
     }
 
     /// Gives back the space of what was removed, some of it at a time; a database that does so by itself does nothing
     /// here.
-    fn reclaim(&self) -> impl Future<Output = Result<(), Error>> + Send {
-        async { Ok(()) }
+    async fn vacuum(&self) -> Result<(), Error> {
+        Ok(())
     }
 
     /// Bytes that the database takes.
-    fn bytes(&self) -> impl Future<Output = Result<u64, Error>> + Send;
+    async fn bytes(&self) -> Result<u64, Error>;
 
-    /// See [`crate::store::Store::has_room`].
+    /// Whether there was room to begin something at the last look, where the store looks: a shared one is for its own
+    /// operators to watch.
     fn has_room(&self) -> bool {
         true
     }
 
-    /// See [`crate::store::Store::notification`].
-    fn next_notification(&self) -> impl Future<Output = Notification> + Send;
+    /// Waits for a change by another process. Notifications may be lost, repeated or stale: whoever handles them looks
+    /// into the store, and looks from time to time without one. Never answers where the store is not shared. For one
+    /// caller at a time.
+    async fn notification(&self) -> Notification;
 
     /// Closes every connection.
-    fn disconnect(&self) -> impl Future<Output = ()> + Send;
+    async fn disconnect(&self);
 }
 
 /// What an operation moves.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(super) enum Size {
+pub enum Size {
     /// A few rows.
     Small,
     /// An input or a result, for a caller who can wait.
@@ -180,7 +185,7 @@ pub(super) enum Size {
 
 /// What an operation does to the room on the disk.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(super) enum WriteIntent {
+pub enum WriteIntent {
     /// It begins something that writes about so many bytes, now or later: on a full disk nothing new is begun.
     Begins(u64),
     /// It changes a few rows.

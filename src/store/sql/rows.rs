@@ -2,13 +2,13 @@
 
 use std::time::{Duration, SystemTime};
 
-use super::{Change, Connection, Row, Statement, webhooks};
+use super::{Connection, Row, Statement, webhooks};
 use crate::domain::InputName;
 use crate::domain::job::{AttachedCalls, AttemptEnd, EventBody, Failure, Job, JobName, JobState, Summary};
 use crate::domain::progress::Progress;
-use crate::store::query::Cursor;
+use crate::store::query::{Cursor, Page, Paged};
 use crate::store::record::Lease;
-use crate::store::{Error, payload};
+use crate::store::{Error, Notification, payload};
 
 /// Columns that [`job`] reads.
 macro_rules! job_columns {
@@ -63,35 +63,35 @@ pub(super) fn integer(value: u64) -> i64 {
 }
 
 /// A column that holds a number of this type.
-pub(super) fn number<T: TryFrom<i64>>(row: &impl Row, column: &str) -> Result<T, Error> {
+pub(super) fn number<T: TryFrom<i64>>(row: &Row, column: &str) -> Result<T, Error> {
     let value = row.integer(column)?;
     T::try_from(value).map_err(|_| Error::Corrupt(format!("{column} {value} is out of range")))
 }
 
-fn optional_time(row: &impl Row, column: &str) -> Result<Option<SystemTime>, Error> {
+fn optional_time(row: &Row, column: &str) -> Result<Option<SystemTime>, Error> {
     Ok(row.optional_integer(column)?.map(time))
 }
 
-fn optional_record<T: serde::de::DeserializeOwned>(row: &impl Row, column: &str) -> Result<Option<T>, Error> {
-    row.optional_bytes(column)?.map(|bytes| payload::decode(&bytes, column)).transpose()
+fn optional_record<T: serde::de::DeserializeOwned>(row: &Row, column: &str) -> Result<Option<T>, Error> {
+    row.optional_bytes(column)?.map(|bytes| payload::decode(bytes, column)).transpose()
 }
 
-pub(super) fn state(row: &impl Row) -> Result<JobState, Error> {
+pub(super) fn state(row: &Row) -> Result<JobState, Error> {
     let name = row.text("state")?;
     JobState::from_name(&name).ok_or_else(|| Error::Corrupt(format!("unknown state {name:?}")))
 }
 
-pub(super) fn name(row: &impl Row) -> Result<JobName, Error> {
+pub(super) fn name(row: &Row) -> Result<JobName, Error> {
     Ok(JobName { tenant: row.text("tenant")?, job: row.text("job")? })
 }
 
-fn attached_calls(row: &impl Row) -> Result<Option<AttachedCalls>, Error> {
+fn attached_calls(row: &Row) -> Result<Option<AttachedCalls>, Error> {
     let Some(_) = row.optional_integer("attached_calls")? else { return Ok(None) };
     Ok(Some(AttachedCalls { attached: number(row, "attached_calls")?, detached: number(row, "detached_calls")? }))
 }
 
 /// A job from a row of `select_jobs!`.
-pub(super) fn job(row: &impl Row) -> Result<Job, Error> {
+pub(super) fn job(row: &Row) -> Result<Job, Error> {
     let name = name(row)?;
     let input = row.optional_text("uploaded_input")?.map(|input| InputName { tenant: name.tenant.clone(), input });
     Ok(Job {
@@ -99,11 +99,11 @@ pub(super) fn job(row: &impl Row) -> Result<Job, Error> {
         input,
         state: state(row)?,
         attempt: number(row, "attempt")?,
-        settings: payload::decode(&row.bytes("settings")?, "settings")?,
+        settings: payload::decode(row.bytes("settings")?, "settings")?,
         view_count: number(row, "view_count")?,
         track_count: number(row, "track_count")?,
         observation_count: number(row, "observation_count")?,
-        labels: payload::decode(&row.bytes("labels")?, "labels")?,
+        labels: payload::decode(row.bytes("labels")?, "labels")?,
         priority: number(row, "priority")?,
         create_time: time(row.integer("create_time")?),
         start_time: optional_time(row, "start_time")?,
@@ -138,7 +138,7 @@ pub(super) struct LockedJob {
 
 impl LockedJob {
     /// From a row of `select_locked_job!`.
-    pub(super) fn from_row(row: &impl Row) -> Result<Self, Error> {
+    pub(super) fn from_row(row: &Row) -> Result<Self, Error> {
         Ok(Self {
             id: row.integer("id")?,
             name: name(row)?,
@@ -153,30 +153,28 @@ impl LockedJob {
     }
 }
 
-/// Rows to ask for where a page has so many: one more tells whether there is a next page.
-pub(super) fn limit(page_size: u32) -> i64 {
-    i64::from(page_size) + 1
-}
-
-/// The page of rows that were asked for with [`limit`], and the token of the next one, where there is one. `id` is the
-/// column that tells those of one time apart.
-pub(super) fn page<R: Row>(
-    mut rows: Vec<R>,
-    page_size: u32,
+/// The page that a query asks for, of what `select` finds beyond its cursor, in order. `id` is the column that tells
+/// those of one time apart.
+pub(super) async fn page<T>(
+    connection: &mut dyn Connection,
+    query: &(impl Paged + Sync),
+    select: Statement,
     id: &str,
-    token_after: impl Fn(&Cursor) -> String,
-) -> Result<(Vec<R>, Option<String>), Error> {
-    let size = page_size as usize;
-    let more = rows.len() > size;
-    rows.truncate(size);
+    item: impl Fn(&Row) -> Result<T, Error>,
+) -> Result<Page<T>, Error> {
+    let size = query.effective_page_size();
+    // One more tells whether there is a next page.
+    let mut rows = connection.rows(select.then(" LIMIT ").then_bind(i64::from(size) + 1)).await?;
+    let more = rows.len() > size as usize;
+    rows.truncate(size as usize);
     let next_page_token = match rows.last() {
         Some(last) if more => {
             let cursor = Cursor { create_micros: last.integer("create_time")?, id: last.text(id)? };
-            Some(token_after(&cursor))
+            Some(query.token_after(&cursor))
         }
         _ => None,
     };
-    Ok((rows, next_page_token))
+    Ok(Page { items: rows.iter().map(item).collect::<Result<_, _>>()?, next_page_token })
 }
 
 /// `SELECT` of all that [`LockedJob::from_row`] reads; the clauses follow.
@@ -192,17 +190,17 @@ macro_rules! select_locked_job {
 pub(super) use select_locked_job;
 
 /// Locks a job: it does not change until the transaction ends.
-pub(super) async fn locked_job<C: Connection>(connection: &mut C, name: &JobName) -> Result<LockedJob, Error> {
+pub(super) async fn locked_job(connection: &mut dyn Connection, name: &JobName) -> Result<LockedJob, Error> {
     let select = Statement::new(select_locked_job!("WHERE tenant = $1 AND job = $2"))
         .bind(&name.tenant)
         .bind(&name.job)
-        .then(C::FOR_UPDATE);
+        .then(connection.for_update());
     let row = connection.optional_row(select).await?;
     row.as_ref().map_or_else(|| Err(Error::NotFound(name.clone())), LockedJob::from_row)
 }
 
 /// Locks a job that this lease still holds: what every write of a worker begins with.
-pub(super) async fn held<C: Connection>(connection: &mut C, lease: &Lease) -> Result<LockedJob, Error> {
+pub(super) async fn held(connection: &mut dyn Connection, lease: &Lease) -> Result<LockedJob, Error> {
     match locked_job(connection, &lease.name).await {
         Ok(job) if job.state == JobState::Running && job.attempt == lease.attempt => Ok(job),
         Ok(_) | Err(Error::NotFound(_)) => Err(Error::Fenced(lease.clone())),
@@ -255,8 +253,8 @@ impl Transition<'_> {
 
 /// Moves a job out of its state, with the event that says so: to the queue, or to an end. Its lease ends with it.
 /// Returns the job as it stands then.
-pub(super) async fn transition<C: Connection>(
-    connection: &mut C,
+pub(super) async fn transition(
+    connection: &mut dyn Connection,
     job: &LockedJob,
     transition: Transition<'_>,
     now: SystemTime,
@@ -295,14 +293,14 @@ pub(super) async fn transition<C: Connection>(
     if changed.webhook.is_some() && next.is_terminal() {
         connection.execute(webhooks::due(job.id)).await?;
     }
-    connection.notify(Change::Events, &job.name).await?;
+    connection.notify(Notification::Events(job.name.clone())).await?;
     if next == JobState::Queued {
-        connection.notify(Change::Queued, &job.name).await?;
+        connection.notify(Notification::Queued).await?;
     }
     Ok(changed)
 }
 
 /// The job of a batch that changes one.
-pub(super) fn one_job(rows: &[impl Row]) -> Result<Job, Error> {
+pub(super) fn one_job(rows: &[Row]) -> Result<Job, Error> {
     rows.first().map_or_else(|| Err(Error::Corrupt("a job that was just changed is not there".into())), job)
 }

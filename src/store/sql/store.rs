@@ -1,29 +1,32 @@
 //! The store that every database makes: one transaction an operation, within a bound of time, and measured.
 
 use std::future::Future;
-use std::sync::Arc;
+use std::sync::{Arc, Mutex, PoisonError};
 use std::time::{Duration, SystemTime};
 
 use futures_util::FutureExt;
 
 use super::Size::{Payload, Small};
 use super::WriteIntent::{Begins, Ends, Little};
-use super::{Database, Size, WriteIntent, admin, attempts, claims, jobs, operation, removal, uploads, webhooks};
+use super::{
+    Connection, Database, Operation, Size, WriteIntent, admin, attempts, claims, jobs, operation, removal, uploads,
+    webhooks,
+};
 use crate::domain::InputName;
 use crate::domain::job::{Job, JobEvent, JobName};
 use crate::domain::progress::Progress;
 use crate::store::record::{
-    CancelReply, Claim, Claims, Created, EncodedResult, Ending, Heartbeat, JobInput, JobPayload, Lease, NewRecord,
-    Outcome, PassedOver, QueueReport, QueueStats, Request, RetryReply, StoreStats, Swept, WebhookOutcome, WebhookQueue,
+    Changed, Claim, Claims, EncodedResult, Ending, Heartbeat, JobInput, JobPayload, Lease, NewRecord, Outcome,
+    PassedOver, QueueReport, QueueStats, Request, StoreStats, Swept, WebhookOutcome, WebhookQueue,
 };
 use crate::store::upload::{BegunUpload, NewInput, NewUpload, PurgedUploads, StoredInput, UploadLease, UploadStatus};
-use crate::store::{Error, InputPage, InputQuery, JobPage, JobQuery, Notification, QueueBounds, Store, UploadBounds};
+use crate::store::{Error, InputQuery, JobQuery, Page, QueueBounds, UploadBounds};
 use crate::telemetry::metrics::{store_operation, write_fenced};
 
 /// Waits for an operation as long as the database allows it. One that is broken off changed nothing, or all that it was
 /// to change: a commit may have been on its way.
-async fn bounded<D: Database, T>(
-    database: &D,
+async fn bounded<T>(
+    database: &dyn Database,
     size: Size,
     operation: impl Future<Output = Result<T, Error>> + Send,
 ) -> Result<T, Error> {
@@ -59,6 +62,29 @@ macro_rules! reads {
     };
 }
 
+/// What an operation gave in the transaction that was committed.
+async fn written<T: Send + 'static>(
+    database: &dyn Database,
+    size: Size,
+    intent: WriteIntent,
+    run: Operation<dyn Connection, T>,
+) -> Result<T, Error> {
+    let latest = Arc::new(Mutex::new(None));
+    let keep = latest.clone();
+    let run_and_keep = operation::<dyn Connection, _>(move |connection| {
+        let (running, keep) = (run(connection), keep.clone());
+        async move {
+            let value = running.await?;
+            *keep.lock().unwrap_or_else(PoisonError::into_inner) = Some(value);
+            Ok(())
+        }
+        .boxed()
+    });
+    database.write(size, intent, run_and_keep).await?;
+    let value = latest.lock().unwrap_or_else(PoisonError::into_inner).take();
+    value.ok_or_else(|| Error::Corrupt("an operation was committed without an answer".into()))
+}
+
 /// Bytes of what removes as much as there is.
 const ANY_BYTES: u64 = u64::MAX;
 
@@ -71,22 +97,30 @@ macro_rules! writes {
     ($database:expr, $size:expr, $intent:expr, [$($owned:ident),*], |$connection:ident| $body:expr) => {{
         let intent: WriteIntent = $intent;
         $(let $owned = $owned.clone();)*
-        let run = operation::<D::Writing, _>(move |$connection| {
+        let run = operation::<dyn Connection, _>(move |$connection| {
             $(let $owned = $owned.clone();)*
             async move { $body.await }.boxed()
         });
-        bounded($database, $size, $database.write($size, intent, run)).await
+        bounded($database, $size, written($database, $size, intent, run)).await
     }};
 }
 
-#[async_trait::async_trait]
-impl<D: Database> Store for D {
-    async fn create_jobs(
+/// A store of jobs. Every operation is one transaction: state, event and lease change together or not at all.
+///
+/// `now` is the caller's clock, so that tests need not wait; times are kept to the microsecond.
+impl dyn Database {
+    /// Stores queued jobs with their inputs and their first events, all or none, unless the request id of one is known
+    /// or admission refuses; the answers are in their order. A request id that comes twice with the same body is one job: with [`NewRecord::cancel_on_disconnect`] the call attaches to it, as far as it depends on
+    /// its calls ([`Job::attached_calls`]), and without it does not depend on any from then on.
+    ///
+    /// # Errors
+    /// [`Error::AlreadyExists`], [`Error::QueueFull`], [`Error::BatchTooLarge`], of the first job that is refused.
+    pub async fn create_jobs(
         &self,
         new: Vec<NewRecord>,
         bounds: &QueueBounds,
         now: SystemTime,
-    ) -> Result<Vec<Created>, Error> {
+    ) -> Result<Vec<Changed>, Error> {
         let new: Arc<[NewRecord]> = new.into();
         let stored = new.iter().map(|new| match &new.input {
             JobInput::Inline(bytes) => bytes.len() as u64,
@@ -97,52 +131,95 @@ impl<D: Database> Store for D {
         ))
     }
 
-    async fn requested_job(&self, tenant: &str, request: &Request) -> Result<Option<Job>, Error> {
+    /// The job that a tenant's request made before; `None` where it made none, or the job is gone.
+    ///
+    /// # Errors
+    /// [`Error::AlreadyExists`] for a request id with another body.
+    pub async fn requested_job(&self, tenant: &str, request: &Request) -> Result<Option<Job>, Error> {
         reads!(self, "requested_job", Small, |connection| jobs::earlier(connection, tenant, request))
     }
 
-    async fn job(&self, name: &JobName) -> Result<Job, Error> {
+    /// # Errors
+    /// [`Error::NotFound`].
+    pub async fn job(&self, name: &JobName) -> Result<Job, Error> {
         reads!(self, "job", Small, |connection| jobs::get(connection, name))
     }
 
-    async fn jobs(&self, query: &JobQuery) -> Result<JobPage, Error> {
+    /// One page of a tenant's jobs.
+    ///
+    /// # Errors
+    /// [`Error::PageToken`].
+    pub async fn jobs(&self, query: &JobQuery) -> Result<Page<Job>, Error> {
         reads!(self, "jobs", Small, |connection| jobs::list(connection, query))
     }
 
-    async fn events_after(&self, name: &JobName, after: u64, limit: u32) -> Result<Vec<JobEvent>, Error> {
+    /// At most `limit` events with a sequence number above `after`, in order.
+    ///
+    /// # Errors
+    /// [`Error::NotFound`].
+    pub async fn events_after(&self, name: &JobName, after: u64, limit: u32) -> Result<Vec<JobEvent>, Error> {
         reads!(self, "events_after", Small, |connection| jobs::events_after(connection, name, after, limit))
     }
 
-    async fn claim(&self, claim: &Claim, now: SystemTime) -> Result<Claims, Error> {
+    /// Leases the next job in the queue and begins it; nothing where none waits, or the queue is paused. Tenants
+    /// take turns, by their weights; within a tenant jobs go by priority, then age. Jobs past their deadline are left to [`Self::sweep`].
+    ///
+    /// The claim may also prefetch: it leases the job after it, which stays queued until a later claim begins it. Other
+    /// claims pass over a prefetched job until that lease expires, but for those that find no other job. Nothing need
+    /// be given back: a prefetched job that is not begun in time is any worker's, and no attempt was made.
+    ///
+    /// A suspect ([`Claim::suspect_after`]) is leased as long as a job that is begun, and not begun; a claim that is to
+    /// begin it extends that lease, or ends it with a `lease_for` of zero. Where nothing else runs in the process, the
+    /// claim begins it; the same claim once more, for want of an answer, gives the attempt that was begun.
+    pub async fn claim(&self, claim: &Claim, now: SystemTime) -> Result<Claims, Error> {
         let _timer = store_operation("claim");
         // At once: `now` is what the wall clock showed at the call, and it may be set before the database answers.
         let lease_now = self.lease_clock(now);
         // Idle workers look for jobs again and again: a read is one question over the network, a transaction is three.
-        if D::SHARED && claim.begin.is_none() && !reads!(self, Small, |connection| claims::may_claim(connection))? {
+        if self.is_shared()
+            && claim.begin.is_none()
+            && !reads!(self, Small, |connection| claims::may_claim(connection))?
+        {
             return Ok(Claims::default());
         }
         writes!(self, Small, Begins(0), [claim], |connection| claims::claim(connection, &claim, now, lease_now))
     }
 
-    async fn job_payload(&self, name: &JobName) -> Result<JobPayload, Error> {
+    /// The encoded input of a job, and whether its cancel has been asked for.
+    ///
+    /// # Errors
+    /// [`Error::NotFound`].
+    pub async fn job_payload(&self, name: &JobName) -> Result<JobPayload, Error> {
         reads!(self, "work", Payload, |connection| jobs::job_payload(connection, name))
     }
 
-    async fn heartbeat(&self, lease: &Lease, now: SystemTime, lease_for: Duration) -> Result<Heartbeat, Error> {
+    /// Extends a lease and brings back what its holder must know.
+    ///
+    /// # Errors
+    /// [`Error::Fenced`].
+    pub async fn heartbeat(&self, lease: &Lease, now: SystemTime, lease_for: Duration) -> Result<Heartbeat, Error> {
         let expires = self.lease_clock(now) + lease_for;
         writes!(self, "heartbeat", Small, Ends(0), [lease], |connection| attempts::heartbeat(
             connection, &lease, expires
         ))
     }
 
-    async fn record(&self, lease: &Lease, progress: &Progress, now: SystemTime) -> Result<u64, Error> {
+    /// Appends a progress event; returns its sequence number.
+    ///
+    /// # Errors
+    /// [`Error::Fenced`].
+    pub async fn record(&self, lease: &Lease, progress: &Progress, now: SystemTime) -> Result<u64, Error> {
         let progress = *progress;
         writes!(self, "record", Small, Little, [lease], |connection| attempts::record(
             connection, &lease, &progress, now
         ))
     }
 
-    async fn finish(&self, lease: &Lease, ending: &Arc<Ending>, now: SystemTime) -> Result<Job, Error> {
+    /// Ends an attempt and its job, with the result where there is one. Returns the job as it stands then.
+    ///
+    /// # Errors
+    /// [`Error::Fenced`].
+    pub async fn finish(&self, lease: &Lease, ending: &Arc<Ending>, now: SystemTime) -> Result<Job, Error> {
         let bytes = match &ending.outcome {
             Outcome::Succeeded { result, .. } => result.bytes.len() as u64,
             Outcome::Failed(_) | Outcome::Cancelled | Outcome::DeadlineExceeded => 0,
@@ -152,58 +229,92 @@ impl<D: Database> Store for D {
         })
     }
 
-    async fn release(&self, lease: &Lease, now: SystemTime) -> Result<Job, Error> {
+    /// Gives a lease back. The job returns to the queue, or ends if its cancel was asked for; the attempt does not
+    /// count against the cap. Returns the job as it stands then.
+    ///
+    /// # Errors
+    /// [`Error::Fenced`].
+    pub async fn release(&self, lease: &Lease, now: SystemTime) -> Result<Job, Error> {
         writes!(self, "release", Small, Ends(0), [lease], |connection| attempts::release(connection, &lease, now))
     }
 
-    async fn request_cancel(&self, name: &JobName, etag: Option<&str>, now: SystemTime) -> Result<CancelReply, Error> {
+    /// Asks for the end of a job: a queued one ends at once, a running one is flagged for its worker, an ended one is
+    /// left as it is. With an `etag`, only where it is the job's.
+    ///
+    /// # Errors
+    /// [`Error::NotFound`], [`Error::EtagMismatch`].
+    pub async fn request_cancel(&self, name: &JobName, etag: Option<&str>, now: SystemTime) -> Result<Changed, Error> {
         let etag = etag.map(str::to_owned);
         writes!(self, "request_cancel", Small, Ends(0), [name, etag], |connection| {
             attempts::request_cancel(connection, &name, etag.as_deref(), now)
         })
     }
 
-    async fn retry_job(
+    /// Puts a job that ended without a result into the queue again, as far as the bounds allow it: with its attempts
+    /// counted anew, without a deadline that has passed, and without a caller that it depends on. One that waits or
+    /// runs is left as it is. With an `etag`, only where it is the job's.
+    ///
+    /// # Errors
+    /// [`Error::NotFound`], [`Error::EtagMismatch`], [`Error::Succeeded`], [`Error::QueueFull`].
+    pub async fn retry_job(
         &self,
         name: &JobName,
         etag: Option<&str>,
         bounds: &QueueBounds,
         now: SystemTime,
-    ) -> Result<RetryReply, Error> {
+    ) -> Result<Changed, Error> {
         let etag = etag.map(str::to_owned);
         writes!(self, "retry_job", Small, Begins(0), [name, etag, bounds], |connection| {
             admin::retry(connection, &name, etag.as_deref(), &bounds, now)
         })
     }
 
-    async fn set_priority(&self, name: &JobName, etag: Option<&str>, priority: i32) -> Result<Job, Error> {
+    /// Changes the priority of a queued job. With an `etag`, only where it is the job's.
+    ///
+    /// # Errors
+    /// [`Error::NotFound`], [`Error::EtagMismatch`], [`Error::NotQueued`].
+    pub async fn set_priority(&self, name: &JobName, etag: Option<&str>, priority: i32) -> Result<Job, Error> {
         let etag = etag.map(str::to_owned);
         writes!(self, "set_priority", Small, Little, [name, etag], |connection| {
             admin::set_priority(connection, &name, etag.as_deref(), priority)
         })
     }
 
-    async fn set_paused(&self, paused: bool, now: SystemTime) -> Result<(), Error> {
+    /// Pauses the queue, in which no claim finds a job from then on, or resumes it; for every process and over
+    /// restarts. What is so already stays as it is.
+    pub async fn set_paused(&self, paused: bool, now: SystemTime) -> Result<(), Error> {
         writes!(self, "set_paused", Small, Ends(0), [], |connection| admin::set_paused(connection, paused, now))
     }
 
-    async fn queue(&self, tenants: u32) -> Result<QueueReport, Error> {
+    /// The queue as its administrator sees it, with at most `tenants` tenants.
+    pub async fn queue(&self, tenants: u32) -> Result<QueueReport, Error> {
         // Counts every job that is kept.
         reads!(self, "queue", Payload, |connection| admin::queue(connection, tenants))
     }
 
-    async fn detach(&self, name: &JobName, created: SystemTime) -> Result<Job, Error> {
+    /// Counts that a call was disconnected that had attached to the job, unless it no longer depends on its calls or is
+    /// another one of the same name, which was not `created` then. Returns the job as it stands then.
+    ///
+    /// # Errors
+    /// [`Error::NotFound`].
+    pub async fn detach(&self, name: &JobName, created: SystemTime) -> Result<Job, Error> {
         writes!(self, "detach", Small, Ends(0), [name], |connection| jobs::detach(connection, &name, created))
     }
 
-    async fn delete_job(&self, name: &JobName, etag: Option<&str>) -> Result<(), Error> {
+    /// Removes an ended job with its events, attempts, input, result, request ids and webhook. With an `etag`, only
+    /// where it is the job's.
+    ///
+    /// # Errors
+    /// [`Error::NotFound`], [`Error::EtagMismatch`], [`Error::NotEnded`].
+    pub async fn delete_job(&self, name: &JobName, etag: Option<&str>) -> Result<(), Error> {
         let etag = etag.map(str::to_owned);
         writes!(self, "delete_job", Payload, Ends(ANY_BYTES), [name, etag], |connection| {
             removal::delete(connection, &name, etag.as_deref())
         })
     }
 
-    async fn purge(&self, ended_by: SystemTime, limit: u32) -> Result<u32, Error> {
+    /// Removes at most `limit` of the jobs that ended at that time or before, the oldest first. Returns how many.
+    pub async fn purge(&self, ended_by: SystemTime, limit: u32) -> Result<u32, Error> {
         let _timer = store_operation("purge");
         if !reads!(self, Small, |connection| removal::needs_purge(connection, ended_by))? {
             return Ok(0);
@@ -211,13 +322,18 @@ impl<D: Database> Store for D {
         writes!(self, Payload, Ends(ANY_BYTES), [], |connection| removal::purge(connection, ended_by, limit))
     }
 
-    async fn reclaim(&self) -> Result<(), Error> {
-        measured("reclaim", bounded(self, Small, Database::reclaim(self))).await
+    /// Gives some of the space that removed jobs took back to the file system, where the database does not do so by
+    /// itself.
+    pub async fn reclaim(&self) -> Result<(), Error> {
+        measured("reclaim", bounded(self, Small, self.vacuum())).await
     }
 
-    async fn recover(&self, now: SystemTime, max_attempts: u32) -> Result<Vec<Job>, Error> {
+    /// Takes back every lease that no living process can hold: all of them where one process has the store to itself,
+    /// those that ran out where it is shared. Called once, before the first claim. A job that lost `max_attempts`
+    /// attempts this way fails with `ATTEMPTS_EXHAUSTED`. Returns the jobs that changed.
+    pub async fn recover(&self, now: SystemTime, max_attempts: u32) -> Result<Vec<Job>, Error> {
         // Where no other process can be at work, every lease is a dead one's.
-        let expired_at = D::SHARED.then(|| self.lease_clock(now));
+        let expired_at = self.is_shared().then(|| self.lease_clock(now));
         writes!(self, "recover", Small, Ends(0), [], |connection| attempts::take_back(
             connection,
             expired_at,
@@ -226,7 +342,8 @@ impl<D: Database> Store for D {
         ))
     }
 
-    async fn sweep(&self, now: SystemTime, max_attempts: u32) -> Result<Swept, Error> {
+    /// Takes back leases that ran out, as [`Self::recover`] does, and ends queued jobs that are past their deadline.
+    pub async fn sweep(&self, now: SystemTime, max_attempts: u32) -> Result<Swept, Error> {
         let _timer = store_operation("sweep");
         // Before the clocks are compared: see `claim`.
         let expired_at = self.lease_clock(now);
@@ -242,11 +359,21 @@ impl<D: Database> Store for D {
         })
     }
 
-    async fn result(&self, name: &JobName) -> Result<Option<EncodedResult>, Error> {
+    /// The encoded result of a job; `None` where there is none. Whether it is intact is for the caller to ask: it takes
+    /// long.
+    ///
+    /// # Errors
+    /// [`Error::NotFound`].
+    pub async fn result(&self, name: &JobName) -> Result<Option<EncodedResult>, Error> {
         reads!(self, "result", Payload, |connection| jobs::result(connection, name))
     }
 
-    async fn begin_upload(
+    /// Begins an upload, or goes on with one: from here on its earlier streams cannot write.
+    ///
+    /// # Errors
+    /// [`Error::AlreadyExists`] where it was begun with another length or hash, [`Error::UploadsFull`],
+    /// [`Error::UploadTooLarge`].
+    pub async fn begin_upload(
         &self,
         new: &NewUpload,
         bounds: &UploadBounds,
@@ -258,7 +385,11 @@ impl<D: Database> Store for D {
         ))
     }
 
-    async fn append_upload(
+    /// Adds bytes to an upload, at its end.
+    ///
+    /// # Errors
+    /// [`Error::UploadTakenOver`], [`Error::UploadNotFound`] where it was given up.
+    pub async fn append_upload(
         &self,
         lease: &UploadLease,
         at_byte: u64,
@@ -271,11 +402,19 @@ impl<D: Database> Store for D {
         })
     }
 
-    async fn read_upload(&self, lease: &UploadLease, at_byte: u64) -> Result<Vec<u8>, Error> {
+    /// Some of an upload's bytes from there on, which must be where a read before it ended; none at the end.
+    ///
+    /// # Errors
+    /// [`Error::UploadTakenOver`].
+    pub async fn read_upload(&self, lease: &UploadLease, at_byte: u64) -> Result<Vec<u8>, Error> {
         reads!(self, "read_upload", Payload, |connection| uploads::read(connection, lease, at_byte))
     }
 
-    async fn finish_upload(
+    /// Makes an input of an upload whose bytes are all there.
+    ///
+    /// # Errors
+    /// [`Error::UploadTakenOver`], [`Error::UploadNotFound`] where it was given up.
+    pub async fn finish_upload(
         &self,
         lease: &UploadLease,
         new: &Arc<NewInput>,
@@ -287,27 +426,51 @@ impl<D: Database> Store for D {
         })
     }
 
-    async fn give_up_upload(&self, lease: &UploadLease) -> Result<(), Error> {
+    /// Gives an upload up: its id is free again.
+    ///
+    /// # Errors
+    /// [`Error::UploadTakenOver`], [`Error::UploadNotFound`].
+    pub async fn give_up_upload(&self, lease: &UploadLease) -> Result<(), Error> {
         writes!(self, "give_up_upload", Small, Ends(0), [lease], |connection| uploads::give_up(connection, &lease))
     }
 
-    async fn upload(&self, name: &InputName) -> Result<UploadStatus, Error> {
+    /// How far an upload has come.
+    ///
+    /// # Errors
+    /// [`Error::UploadNotFound`].
+    pub async fn upload(&self, name: &InputName) -> Result<UploadStatus, Error> {
         reads!(self, "upload", Small, |connection| uploads::status(connection, name))
     }
 
-    async fn uploaded_input(&self, name: &InputName) -> Result<StoredInput, Error> {
+    /// An uploaded input.
+    ///
+    /// # Errors
+    /// [`Error::InputNotFound`].
+    pub async fn uploaded_input(&self, name: &InputName) -> Result<StoredInput, Error> {
         reads!(self, "uploaded_input", Small, |connection| uploads::input(connection, name))
     }
 
-    async fn inputs(&self, query: &InputQuery) -> Result<InputPage, Error> {
+    /// One page of a tenant's uploaded inputs.
+    ///
+    /// # Errors
+    /// [`Error::PageToken`].
+    pub async fn inputs(&self, query: &InputQuery) -> Result<Page<StoredInput>, Error> {
         reads!(self, "inputs", Small, |connection| uploads::list(connection, query))
     }
 
-    async fn delete_input(&self, name: &InputName) -> Result<(), Error> {
+    /// Takes an uploaded input's name away, which is free again at once. Jobs that were created with it keep it; it is
+    /// removed with the last of them, or at once where there is none.
+    ///
+    /// # Errors
+    /// [`Error::InputNotFound`].
+    pub async fn delete_input(&self, name: &InputName) -> Result<(), Error> {
         writes!(self, "delete_input", Payload, Ends(ANY_BYTES), [name], |connection| uploads::delete(connection, &name))
     }
 
-    async fn purge_uploads(
+    /// Gives up the uploads to which nothing came since `abandoned_by`, and removes some of the bytes of those that
+    /// were given up or finished, and some of the uploaded inputs that no job has and none was created with since
+    /// `unused_since`. `None`: none.
+    pub async fn purge_uploads(
         &self,
         abandoned_by: Option<SystemTime>,
         unused_since: Option<SystemTime>,
@@ -321,16 +484,21 @@ impl<D: Database> Store for D {
         })
     }
 
-    async fn queue_stats(&self) -> Result<QueueStats, Error> {
+    /// What waits and what runs.
+    pub async fn queue_stats(&self) -> Result<QueueStats, Error> {
         reads!(self, "load", Small, |connection| jobs::queue_stats(connection))
     }
 
-    async fn webhook_queue(&self, now: SystemTime) -> Result<WebhookQueue, Error> {
+    /// What is to be sent to the webhooks of jobs that have ended.
+    pub async fn webhook_queue(&self, now: SystemTime) -> Result<WebhookQueue, Error> {
         let due_by = self.lease_clock(now);
         reads!(self, "webhook_queue", Small, |connection| webhooks::queue(connection, due_by))
     }
 
-    async fn claim_webhook(
+    /// Leases the delivery of a job's end that is due, passing over some hosts and tenants, and counts an attempt at
+    /// it: first attempts in the order of the jobs, then what is due the longest. Returns the job as it stands then;
+    /// `None` where nothing is due. A delivery whose lease runs out is due again.
+    pub async fn claim_webhook(
         &self,
         passed: &PassedOver,
         now: SystemTime,
@@ -345,7 +513,14 @@ impl<D: Database> Store for D {
         ))
     }
 
-    async fn settle_webhook(&self, claimed: &Job, outcome: &WebhookOutcome, now: SystemTime) -> Result<bool, Error> {
+    /// Notes what the attempt at the delivery of a `claimed` job came to. `false` where the job is gone, or another
+    /// attempt has begun since: nothing is noted then.
+    pub async fn settle_webhook(
+        &self,
+        claimed: &Job,
+        outcome: &WebhookOutcome,
+        now: SystemTime,
+    ) -> Result<bool, Error> {
         let now = self.lease_clock(now);
         let claimed = Arc::new(claimed.clone());
         writes!(self, "settle_webhook", Small, Ends(0), [claimed, outcome], |connection| webhooks::settle(
@@ -353,27 +528,16 @@ impl<D: Database> Store for D {
         ))
     }
 
-    async fn stats(&self) -> Result<StoreStats, Error> {
+    /// What operators watch.
+    pub async fn stats(&self) -> Result<StoreStats, Error> {
         let _timer = store_operation("stats");
         let (tenants, oldest_queue_time) = reads!(self, Small, |connection| jobs::by_tenant(connection))?;
         let bytes = bounded(self, Small, self.bytes()).await?;
         Ok(StoreStats { bytes, oldest_queue_time, tenants })
     }
 
-    fn is_shared(&self) -> bool {
-        D::SHARED
-    }
-
-    fn has_room(&self) -> bool {
-        Database::has_room(self)
-    }
-
-    /// Not measured: it waits for others.
-    async fn notification(&self) -> Notification {
-        self.next_notification().await
-    }
-
-    async fn close(&self) {
+    /// Closes every connection; what was acknowledged is durable without it.
+    pub async fn close(&self) {
         let _timer = store_operation("close");
         self.disconnect().await;
     }

@@ -6,8 +6,9 @@ use std::time::SystemTime;
 use super::rows::{self, integer, micros, number};
 use super::{Connection, Lock, Row, Statement, jobs};
 use crate::domain::input_name::InputName;
+use crate::store::query::Paged;
 use crate::store::upload::{BegunUpload, NewInput, NewUpload, PurgedUploads, StoredInput, UploadLease, UploadStatus};
-use crate::store::{Error, InputPage, InputQuery, TakenId, UploadBounds, payload};
+use crate::store::{Error, InputQuery, Page, TakenId, UploadBounds, payload};
 
 /// Rows of parts that one look removes at most, 32 MB of them: writers wait meanwhile.
 const PURGE_PARTS: u32 = 128;
@@ -42,13 +43,13 @@ struct Upload {
     input_id: Option<i64>,
 }
 
-async fn find<C: Connection>(connection: &mut C, name: &InputName, lock: bool) -> Result<Option<Upload>, Error> {
+async fn find(connection: &mut dyn Connection, name: &InputName, lock: bool) -> Result<Option<Upload>, Error> {
     let select = Statement::new(
         "SELECT id, bytes, sha256, committed, writer, input_id FROM uploads WHERE tenant = $1 AND upload = $2",
     )
     .bind(&name.tenant)
     .bind(&name.input)
-    .then(if lock { C::FOR_UPDATE } else { "" });
+    .then(if lock { connection.for_update() } else { "" });
     let Some(row) = connection.optional_row(select).await? else { return Ok(None) };
     Ok(Some(Upload {
         id: row.integer("id")?,
@@ -60,12 +61,12 @@ async fn find<C: Connection>(connection: &mut C, name: &InputName, lock: bool) -
     }))
 }
 
-fn digest(bytes: Vec<u8>) -> Result<[u8; 32], Error> {
+fn digest(bytes: &[u8]) -> Result<[u8; 32], Error> {
     bytes.try_into().map_err(|_| Error::Corrupt("a SHA-256 has not 32 bytes".into()))
 }
 
 /// The upload that this lease still holds: what every write begins with.
-async fn held<C: Connection>(connection: &mut C, lease: &UploadLease) -> Result<Upload, Error> {
+async fn held(connection: &mut dyn Connection, lease: &UploadLease) -> Result<Upload, Error> {
     match find(connection, &lease.name, true).await? {
         Some(upload) if upload.writer == lease.writer && upload.input_id.is_none() => Ok(upload),
         Some(_) => Err(Error::UploadTakenOver(lease.name.clone())),
@@ -74,8 +75,8 @@ async fn held<C: Connection>(connection: &mut C, lease: &UploadLease) -> Result<
 }
 
 /// Begins an upload, or goes on with one; see [`crate::store::Store::begin_upload`].
-pub(super) async fn begin<C: Connection>(
-    connection: &mut C,
+pub(super) async fn begin(
+    connection: &mut dyn Connection,
     new: &NewUpload,
     bounds: &UploadBounds,
     now: SystemTime,
@@ -110,8 +111,8 @@ pub(super) async fn begin<C: Connection>(
 }
 
 /// The input that a finished upload of this name became; whoever asks for it anew is going to use it.
-async fn begun_again<C: Connection>(
-    connection: &mut C,
+async fn begun_again(
+    connection: &mut dyn Connection,
     new: &NewUpload,
     now: SystemTime,
 ) -> Result<Option<StoredInput>, Error> {
@@ -136,8 +137,8 @@ fn check_same(new: &NewUpload, bytes: u64, sha256: Option<[u8; 32]>) -> Result<(
     Err(Error::AlreadyExists(TakenId::Upload(new.name.clone(), what)))
 }
 
-async fn open<C: Connection>(
-    connection: &mut C,
+async fn open(
+    connection: &mut dyn Connection,
     new: &NewUpload,
     bounds: &UploadBounds,
     now: SystemTime,
@@ -174,8 +175,8 @@ async fn open<C: Connection>(
 }
 
 /// Adds bytes at the end.
-pub(super) async fn append<C: Connection>(
-    connection: &mut C,
+pub(super) async fn append(
+    connection: &mut dyn Connection,
     lease: &UploadLease,
     at_byte: u64,
     data: &[u8],
@@ -198,11 +199,7 @@ pub(super) async fn append<C: Connection>(
 }
 
 /// Some of the bytes from there on; none at the end.
-pub(super) async fn read<C: Connection>(
-    connection: &mut C,
-    lease: &UploadLease,
-    at_byte: u64,
-) -> Result<Vec<u8>, Error> {
+pub(super) async fn read(connection: &mut dyn Connection, lease: &UploadLease, at_byte: u64) -> Result<Vec<u8>, Error> {
     let upload = match find(connection, &lease.name, false).await? {
         Some(upload) if upload.writer == lease.writer && upload.input_id.is_none() => upload,
         _ => return Err(Error::UploadTakenOver(lease.name.clone())),
@@ -215,8 +212,8 @@ pub(super) async fn read<C: Connection>(
 }
 
 /// Makes an input of an upload whose bytes are all there.
-pub(super) async fn finish<C: Connection>(
-    connection: &mut C,
+pub(super) async fn finish(
+    connection: &mut dyn Connection,
     lease: &UploadLease,
     new: &NewInput,
     now: SystemTime,
@@ -248,14 +245,14 @@ pub(super) async fn finish<C: Connection>(
 }
 
 /// Gives an upload up: its id is free again, and its parts are removed by and by.
-pub(super) async fn give_up<C: Connection>(connection: &mut C, lease: &UploadLease) -> Result<(), Error> {
+pub(super) async fn give_up(connection: &mut dyn Connection, lease: &UploadLease) -> Result<(), Error> {
     let upload = held(connection, lease).await?;
     let update = Statement::new("UPDATE uploads SET upload = NULL, leftover = TRUE, writer = writer + 1 WHERE id = $1");
     connection.execute(update.bind(upload.id)).await
 }
 
 /// How far an upload has come.
-pub(super) async fn status<C: Connection>(connection: &mut C, name: &InputName) -> Result<UploadStatus, Error> {
+pub(super) async fn status(connection: &mut dyn Connection, name: &InputName) -> Result<UploadStatus, Error> {
     let found = find(connection, name, false).await?;
     let Some(upload) = found else { return Err(Error::UploadNotFound(name.clone())) };
     let input = match upload.input_id {
@@ -266,7 +263,7 @@ pub(super) async fn status<C: Connection>(connection: &mut C, name: &InputName) 
 }
 
 /// An uploaded input.
-pub(super) async fn input<C: Connection>(connection: &mut C, name: &InputName) -> Result<StoredInput, Error> {
+pub(super) async fn input(connection: &mut dyn Connection, name: &InputName) -> Result<StoredInput, Error> {
     let select =
         Statement::new(select_inputs!("WHERE tenant = $1 AND input = $2")).bind(&name.tenant).bind(&name.input);
     let row = connection.optional_row(select).await?;
@@ -274,25 +271,22 @@ pub(super) async fn input<C: Connection>(connection: &mut C, name: &InputName) -
 }
 
 /// One page of a tenant's uploaded inputs, the newest first.
-pub(super) async fn list<C: Connection>(connection: &mut C, query: &InputQuery) -> Result<InputPage, Error> {
-    let size = query.effective_page_size();
+pub(super) async fn list(connection: &mut dyn Connection, query: &InputQuery) -> Result<Page<StoredInput>, Error> {
     let mut select = Statement::new(select_inputs!("WHERE input IS NOT NULL AND tenant = ")).then_bind(&query.tenant);
     if let Some(cursor) = query.cursor()? {
         select = select.then(" AND (create_time, input) < (").then_bind(cursor.create_micros);
         select = select.then(", ").then_bind(&cursor.id).then(")");
     }
-    let select = select.then(" ORDER BY create_time DESC, input DESC LIMIT ").then_bind(rows::limit(size));
-    let rows = connection.rows(select).await?;
-    let (rows, next_page_token) = rows::page(rows, size, "input", |cursor| query.token_after(cursor))?;
-    Ok(InputPage { inputs: rows.iter().map(stored_input).collect::<Result<_, _>>()?, next_page_token })
+    let select = select.then(" ORDER BY create_time DESC, input DESC");
+    rows::page(connection, query, select, "input", stored_input).await
 }
 
 /// Takes an uploaded input's name away; see [`crate::store::Store::delete_input`].
-pub(super) async fn delete<C: Connection>(connection: &mut C, name: &InputName) -> Result<(), Error> {
+pub(super) async fn delete(connection: &mut dyn Connection, name: &InputName) -> Result<(), Error> {
     let select = Statement::new("SELECT id FROM inputs WHERE tenant = $1 AND input = $2")
         .bind(&name.tenant)
         .bind(&name.input)
-        .then(C::FOR_UPDATE);
+        .then(connection.for_update());
     let row = connection.optional_row(select).await?;
     let id = row.ok_or_else(|| Error::InputNotFound(name.clone()))?.integer("id")?;
     // Those of its upload's parts that are left are removed by and by, as of one that was given up.
@@ -306,10 +300,10 @@ pub(super) async fn delete<C: Connection>(connection: &mut C, name: &InputName) 
 }
 
 /// Removes an input that has no name, once no job has it.
-pub(super) async fn remove_orphan<C: Connection>(connection: &mut C, id: i64) -> Result<(), Error> {
+pub(super) async fn remove_orphan(connection: &mut dyn Connection, id: i64) -> Result<(), Error> {
     // Of two that take away the last uses of it at once, the later one waits, and then sees that the other is gone:
     // what it asks of the row, it asks after the wait.
-    let lock = Statement::new("SELECT id FROM inputs WHERE id = $1").bind(id).then(C::FOR_UPDATE);
+    let lock = Statement::new("SELECT id FROM inputs WHERE id = $1").bind(id).then(connection.for_update());
     connection.execute(lock).await?;
     let delete = Statement::new(
         "DELETE FROM inputs WHERE id = $1 AND input IS NULL \
@@ -318,11 +312,11 @@ pub(super) async fn remove_orphan<C: Connection>(connection: &mut C, id: i64) ->
     connection.execute(delete.bind(id)).await
 }
 
-async fn input_by_id<C: Connection>(connection: &mut C, id: i64) -> Result<StoredInput, Error> {
+async fn input_by_id(connection: &mut dyn Connection, id: i64) -> Result<StoredInput, Error> {
     stored_input(&connection.row(Statement::new(select_inputs!("WHERE id = $1")).bind(id)).await?)
 }
 
-fn stored_input(row: &impl Row) -> Result<StoredInput, Error> {
+fn stored_input(row: &Row) -> Result<StoredInput, Error> {
     Ok(StoredInput {
         name: InputName { tenant: row.text("tenant")?, input: row.text("input")? },
         create_time: rows::time(row.integer("create_time")?),
@@ -336,20 +330,20 @@ fn stored_input(row: &impl Row) -> Result<StoredInput, Error> {
 }
 
 /// Locks the rows of these inputs, in one order whoever asks for them; those that are not there are passed over.
-pub(super) async fn lock<C: Connection>(connection: &mut C, names: &BTreeSet<InputName>) -> Result<(), Error> {
+pub(super) async fn lock(connection: &mut dyn Connection, names: &BTreeSet<InputName>) -> Result<(), Error> {
     for name in names {
         let select = Statement::new("SELECT id FROM inputs WHERE tenant = $1 AND input = $2")
             .bind(&name.tenant)
             .bind(&name.input)
-            .then(C::FOR_UPDATE);
+            .then(connection.for_update());
         connection.execute(select).await?;
     }
     Ok(())
 }
 
 /// The row of an uploaded input that a job is about to have; it stays until the transaction ends.
-pub(super) async fn use_input<C: Connection>(
-    connection: &mut C,
+pub(super) async fn use_input(
+    connection: &mut dyn Connection,
     name: &InputName,
     now: SystemTime,
 ) -> Result<i64, Error> {
@@ -362,8 +356,8 @@ pub(super) async fn use_input<C: Connection>(
 }
 
 /// Whether [`purge`] would find anything.
-pub(super) async fn needs_purge<C: Connection>(
-    connection: &mut C,
+pub(super) async fn needs_purge(
+    connection: &mut dyn Connection,
     abandoned_by: Option<SystemTime>,
     unused_since: Option<SystemTime>,
 ) -> Result<bool, Error> {
@@ -379,8 +373,8 @@ pub(super) async fn needs_purge<C: Connection>(
 }
 
 /// Gives up what nobody goes on with, and removes some of what is of no use any more.
-pub(super) async fn purge<C: Connection>(
-    connection: &mut C,
+pub(super) async fn purge(
+    connection: &mut dyn Connection,
     abandoned_by: Option<SystemTime>,
     unused_since: Option<SystemTime>,
 ) -> Result<PurgedUploads, Error> {
@@ -398,7 +392,7 @@ pub(super) async fn purge<C: Connection>(
             "SELECT id FROM inputs WHERE input IS NOT NULL AND use_time <= $1 \
              AND NOT EXISTS (SELECT 1 FROM jobs WHERE jobs.input_id = inputs.id) ORDER BY use_time, id LIMIT $2",
         );
-        for row in connection.rows(select.bind(micros(time)).bind(PURGE_INPUTS).then(C::SKIP_LOCKED)).await? {
+        for row in connection.rows(select.bind(micros(time)).bind(PURGE_INPUTS).then(connection.skip_locked())).await? {
             let delete = Statement::new("DELETE FROM inputs WHERE id = $1").bind(row.integer("id")?);
             connection.execute(delete).await?;
             purged.inputs += 1;
@@ -408,9 +402,9 @@ pub(super) async fn purge<C: Connection>(
 }
 
 /// Removes some parts of one upload that has no more use for them, and its row with the last of a given up one.
-async fn purge_parts<C: Connection>(connection: &mut C) -> Result<(), Error> {
+async fn purge_parts(connection: &mut dyn Connection) -> Result<(), Error> {
     let select = Statement::new("SELECT id, upload FROM uploads WHERE leftover ORDER BY id LIMIT 1");
-    let Some(row) = connection.optional_row(select.then(C::SKIP_LOCKED)).await? else { return Ok(()) };
+    let Some(row) = connection.optional_row(select.then(connection.skip_locked())).await? else { return Ok(()) };
     let (id, given_up) = (row.integer("id")?, row.optional_text("upload")?.is_none());
     let delete = Statement::new(
         "DELETE FROM upload_parts WHERE upload_id = $1 AND at_byte IN \

@@ -21,15 +21,16 @@ pub(super) fn due(id: i64) -> Statement {
 }
 
 /// Has the end of a job sent that is still to come, as if none had been.
-pub(super) async fn renew<C: Connection>(connection: &mut C, id: i64) -> Result<(), Error> {
-    let select = Statement::new("SELECT job_id, webhook FROM webhooks WHERE job_id = $1").bind(id).then(C::FOR_UPDATE);
+pub(super) async fn renew(connection: &mut dyn Connection, id: i64) -> Result<(), Error> {
+    let select =
+        Statement::new("SELECT job_id, webhook FROM webhooks WHERE job_id = $1").bind(id).then(connection.for_update());
     let Some(row) = connection.optional_row(select).await? else { return Ok(()) };
     let (id, webhook) = read(&row)?;
     connection.execute(update(id, &Webhook::pending(webhook.url), None)?).await
 }
 
 /// What is to be sent; see [`crate::store::Store::webhook_queue`].
-pub(super) async fn queue<C: Connection>(connection: &mut C, due_by: SystemTime) -> Result<WebhookQueue, Error> {
+pub(super) async fn queue(connection: &mut dyn Connection, due_by: SystemTime) -> Result<WebhookQueue, Error> {
     let select = "SELECT COUNT(*) AS pending, MIN(due_time) AS first_due FROM webhooks WHERE due_time IS NOT NULL";
     let row = connection.row(Statement::new(select)).await?;
     let first_due = row.optional_integer("first_due")?;
@@ -37,8 +38,8 @@ pub(super) async fn queue<C: Connection>(connection: &mut C, due_by: SystemTime)
 }
 
 /// Leases what is due until `expires`; see [`crate::store::Store::claim_webhook`].
-pub(super) async fn claim<C: Connection>(
-    connection: &mut C,
+pub(super) async fn claim(
+    connection: &mut dyn Connection,
     passed: &PassedOver,
     due_by: SystemTime,
     expires: SystemTime,
@@ -50,7 +51,7 @@ pub(super) async fn claim<C: Connection>(
     for tenant in &passed.tenants {
         next = next.then(" AND (SELECT tenant FROM jobs WHERE jobs.id = webhooks.job_id) <> ").then_bind(tenant);
     }
-    let next = next.then(" ORDER BY due_time, job_id LIMIT 1").then(C::SKIP_LOCKED);
+    let next = next.then(" ORDER BY due_time, job_id LIMIT 1").then(connection.skip_locked());
     let Some(row) = connection.optional_row(next).await? else { return Ok(None) };
     let (id, webhook) = read(&row)?;
     let webhook = Webhook { attempts: webhook.attempts.saturating_add(1), ..webhook };
@@ -60,8 +61,8 @@ pub(super) async fn claim<C: Connection>(
 }
 
 /// Notes what an attempt came to; see [`crate::store::Store::settle_webhook`].
-pub(super) async fn settle<C: Connection>(
-    connection: &mut C,
+pub(super) async fn settle(
+    connection: &mut dyn Connection,
     claimed: &Job,
     outcome: &WebhookOutcome,
     now: SystemTime,
@@ -76,7 +77,7 @@ pub(super) async fn settle<C: Connection>(
     .bind(micros(claimed.create_time))
     // A job that was retried has another end since.
     .bind(integer(claimed.last_sequence))
-    .then(C::FOR_UPDATE);
+    .then(connection.for_update());
     let Some(row) = connection.optional_row(select).await? else { return Ok(false) };
     let (id, webhook) = read(&row)?;
     // As long as it is pending, the number of attempts is the fencing token.
@@ -93,8 +94,8 @@ pub(super) async fn settle<C: Connection>(
     Ok(true)
 }
 
-fn read(row: &impl Row) -> Result<(i64, Webhook), Error> {
-    Ok((row.integer("job_id")?, payload::decode(&row.bytes("webhook")?, "a webhook")?))
+fn read(row: &Row) -> Result<(i64, Webhook), Error> {
+    Ok((row.integer("job_id")?, payload::decode(row.bytes("webhook")?, "a webhook")?))
 }
 
 fn update(id: i64, webhook: &Webhook, due: Option<SystemTime>) -> Result<Statement, Error> {

@@ -104,17 +104,28 @@ impl WriteConnection {
         Ok(Self { inner: connection, database: PathBuf::new() })
     }
 
-    fn run(&mut self, statement: &Statement) -> Result<Vec<WrittenRow>, Error> {
+    fn run(&mut self, statement: &Statement) -> Result<Vec<Row>, Error> {
         let mut prepared = self.inner.prepare_cached(statement.sql())?;
         bind(&mut prepared, statement.values())?;
         let columns: Arc<[String]> = prepared.column_names().into_iter().map(str::to_owned).collect();
         let mut found = Vec::new();
         let mut rows = prepared.raw_query();
         while let Some(row) = rows.next()? {
-            let cells = (0..columns.len()).map(|place| row.get(place)).collect::<Result<_, _>>()?;
-            found.push(WrittenRow { columns: columns.clone(), cells });
+            let cells = (0..columns.len()).map(|place| row.get(place).map_err(Error::from).and_then(value));
+            found.push(Row::new(columns.clone(), cells.collect::<Result<_, _>>()?));
         }
         Ok(found)
+    }
+}
+
+/// What a cell holds; no column is of reals.
+fn value(cell: Cell) -> Result<Value, Error> {
+    match cell {
+        Cell::Null => Ok(Value::Integer(None)),
+        Cell::Integer(value) => Ok(Value::Integer(Some(value))),
+        Cell::Text(value) => Ok(Value::Text(Some(value))),
+        Cell::Blob(value) => Ok(Value::Bytes(Some(value))),
+        Cell::Real(_) => Err(Error::Corrupt("a column is a real number".into())),
     }
 }
 
@@ -132,71 +143,10 @@ fn bind(prepared: &mut Prepared<'_>, values: &[Value]) -> Result<(), Error> {
     Ok(())
 }
 
+#[async_trait::async_trait]
 impl Connection for WriteConnection {
-    type Row = WrittenRow;
-
-    async fn rows(&mut self, statement: Statement) -> Result<Vec<WrittenRow>, Error> {
+    async fn rows(&mut self, statement: Statement) -> Result<Vec<Row>, Error> {
         self.run(&statement)
-    }
-}
-
-/// A row of its answers.
-pub(in crate::store) struct WrittenRow {
-    columns: Arc<[String]>,
-    cells: Vec<Cell>,
-}
-
-impl WrittenRow {
-    fn cell(&self, column: &str) -> Result<&Cell, Error> {
-        let place = self.columns.iter().position(|name| name == column);
-        let cell = place.and_then(|place| self.cells.get(place));
-        cell.ok_or_else(|| Error::Corrupt(format!("no column {column}")))
-    }
-}
-
-/// The value of a cell as one of these types, by the variant that holds it.
-macro_rules! read_as {
-    ($row:expr, $column:expr, $variant:ident) => {
-        match $row.cell($column)? {
-            Cell::Null => Ok(None),
-            Cell::$variant(value) => Ok(Some(value.clone())),
-            other => Err(Error::Corrupt(format!("{} is {}", $column, other.data_type()))),
-        }
-    };
-}
-
-/// What must not be `NULL`.
-fn required<T>(column: &str, value: Option<T>) -> Result<T, Error> {
-    value.ok_or_else(|| Error::Corrupt(format!("{column} is NULL")))
-}
-
-impl Row for WrittenRow {
-    fn integer(&self, column: &str) -> Result<i64, Error> {
-        required(column, self.optional_integer(column)?)
-    }
-
-    fn optional_integer(&self, column: &str) -> Result<Option<i64>, Error> {
-        read_as!(self, column, Integer)
-    }
-
-    fn flag(&self, column: &str) -> Result<bool, Error> {
-        Ok(self.integer(column)? != 0)
-    }
-
-    fn text(&self, column: &str) -> Result<String, Error> {
-        required(column, self.optional_text(column)?)
-    }
-
-    fn optional_text(&self, column: &str) -> Result<Option<String>, Error> {
-        read_as!(self, column, Text)
-    }
-
-    fn bytes(&self, column: &str) -> Result<Vec<u8>, Error> {
-        required(column, self.optional_bytes(column)?)
-    }
-
-    fn optional_bytes(&self, column: &str) -> Result<Option<Vec<u8>>, Error> {
-        read_as!(self, column, Blob)
     }
 }
 

@@ -8,7 +8,7 @@ use futures_util::future::join_all;
 
 use super::tests::Fixture;
 use super::*;
-use crate::store::{NewRecord, Store, contract};
+use crate::store::{NewRecord, contract};
 
 type Count = Arc<AtomicUsize>;
 

@@ -18,19 +18,15 @@ use std::fs::{File, TryLockError};
 use std::path::{Path, PathBuf};
 use std::time::{Duration, SystemTime};
 
-use sqlx::pool::PoolConnection;
 use sqlx::sqlite::{
     SqliteAutoVacuum, SqliteConnectOptions, SqliteConnection, SqliteJournalMode, SqlitePool, SqlitePoolOptions,
-    SqliteRow,
 };
 
 use super::clock::LeaseClock;
-use super::sql::{self, Connection, Database, Operation, Size, Statement, Step, WriteIntent};
+use super::sql::{self, Connection, Database, Operation, Row, Size, Statement, Step, WriteIntent};
 use super::{Clock, Error, Notification};
 use ballast::{Ballast, SpaceFlag};
 pub(super) use connection::WriteConnection;
-#[cfg(test)]
-pub(super) use connection::WrittenRow;
 use vacuum::{VACUUM, VACUUM_BYTES, VACUUMS};
 use writer::Writer;
 
@@ -117,15 +113,6 @@ impl Sqlite {
         let readers = readers().connect_with(options.pragma("query_only", "1")).await?;
         let clock = LeaseClock::new(Clock::default());
         Ok(Self { writer, has_room, clock, readers, files, _lock: lock })
-    }
-
-    /// Runs statements as they are on the writer's connection, for tests that need the database to misbehave.
-    #[cfg(test)]
-    pub(crate) async fn execute(&self, statements: &'static str) {
-        let run = sql::operation(move |connection: &mut WriteConnection| {
-            Box::pin(async move { Ok(connection.inner().execute_batch(statements)?) })
-        });
-        self.writer.write(WriteIntent::Little, run).await.expect("valid statements");
     }
 }
 
@@ -248,32 +235,31 @@ fn lock(directory: &Path) -> Result<File, Error> {
     }
 }
 
+#[async_trait::async_trait]
 impl Connection for SqliteConnection {
-    type Row = SqliteRow;
-
-    async fn rows(&mut self, statement: Statement) -> Result<Vec<SqliteRow>, Error> {
+    async fn rows(&mut self, statement: Statement) -> Result<Vec<Row>, Error> {
         sql::run::<sqlx::Sqlite>(self, statement).await
     }
 }
 
+#[async_trait::async_trait]
 impl Database for Sqlite {
-    type Writing = WriteConnection;
-    type Reading = PoolConnection<sqlx::Sqlite>;
-
     /// The lock on the directory says that no other process lives here.
-    const SHARED: bool = false;
-
-    async fn reader(&self, _size: Size) -> Result<PoolConnection<sqlx::Sqlite>, Error> {
-        Ok(self.readers.acquire().await?)
+    fn is_shared(&self) -> bool {
+        false
     }
 
-    async fn write<T: Send + 'static>(
+    async fn reader(&self, _size: Size) -> Result<Box<dyn Connection>, Error> {
+        Ok(Box::new(self.readers.acquire().await?))
+    }
+
+    async fn write(
         &self,
         _size: Size,
         intent: WriteIntent,
-        operation: Operation<WriteConnection, T>,
-    ) -> Result<T, Error> {
-        self.writer.write(intent, operation).await
+        operation: Operation<dyn Connection, ()>,
+    ) -> Result<(), Error> {
+        self.writer.write(intent, sql::operation(move |connection: &mut WriteConnection| operation(connection))).await
     }
 
     fn bound(&self, _size: Size) -> Option<Duration> {
@@ -296,7 +282,7 @@ impl Database for Sqlite {
 
     /// Gives the file's free pages back, some at a time. It becomes shorter as the log is written back, which tells it
     /// to: such a log need not be long.
-    async fn reclaim(&self) -> Result<(), Error> {
+    async fn vacuum(&self) -> Result<(), Error> {
         for _ in 0..VACUUMS {
             if !self.writer.vacuum_pays().await? {
                 break;
@@ -310,7 +296,7 @@ impl Database for Sqlite {
         self.has_room.is_set()
     }
 
-    async fn next_notification(&self) -> Notification {
+    async fn notification(&self) -> Notification {
         std::future::pending().await
     }
 

@@ -7,8 +7,7 @@ use tokio::task::JoinHandle;
 
 use super::*;
 use crate::domain::job::JobState;
-use crate::store::sql::Row;
-use crate::store::{Claim, Store, contract};
+use crate::store::{Claim, contract};
 
 /// A store in a directory that lives as long as the test.
 pub(super) struct Fixture {
@@ -39,6 +38,14 @@ impl std::ops::Deref for Fixture {
 }
 
 impl Sqlite {
+    /// Runs statements as they are on the writer's connection, for tests that need the database to misbehave.
+    pub(crate) async fn execute(&self, statements: &'static str) {
+        let run = sql::operation(move |connection: &mut WriteConnection| {
+            Box::pin(async move { Ok(connection.inner().execute_batch(statements)?) })
+        });
+        self.writer.write(WriteIntent::Little, run).await.expect("valid statements");
+    }
+
     /// Lets the database grow no more, and has a write find that out. The writer's next connection knows nothing of the
     /// limit.
     pub(crate) async fn find_no_room(&self) {
@@ -72,9 +79,19 @@ impl Sqlite {
     }
 
     /// What a pragma says on the connection that writes.
-    async fn on_writer<T>(&self, pragma: &'static str, read: fn(&connection::WrittenRow) -> Result<T, Error>) -> T {
-        let rows = self.writer.run(WriteIntent::Little, pragma).await.expect("an answer");
-        read(&rows[0]).expect("a value")
+    async fn on_writer<T: Send + 'static>(&self, pragma: &'static str, read: fn(&Row) -> Result<T, Error>) -> T {
+        let (tell, told) = std::sync::mpsc::channel();
+        let run = sql::operation(move |connection: &mut WriteConnection| {
+            let tell = tell.clone();
+            async move {
+                let rows = connection.rows(Statement::new(pragma)).await?;
+                tell.send(read(&rows[0])?).expect("somebody waits");
+                Ok(())
+            }
+            .boxed()
+        });
+        self.writer.write(WriteIntent::Little, run).await.expect("an answer");
+        told.recv().expect("a value")
     }
 }
 
@@ -215,7 +232,7 @@ async fn deleted_jobs_leave_no_space_taken() {
         largest = largest.max(pages().await);
         fixture.request_cancel(&name, None, contract::time(1)).await.expect("cancels");
         fixture.delete_job(&name, None).await.expect("deletes");
-        Store::reclaim(&*fixture).await.expect("gives back");
+        fixture.reclaim().await.expect("gives back");
         assert!(pages().await < empty + 50, "round {round}: {} pages of {empty} at first", pages().await);
     }
     let chunk_pages = (4 << 20) / 4096;

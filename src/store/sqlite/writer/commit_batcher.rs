@@ -6,7 +6,7 @@ use std::time::{Duration, Instant};
 use tokio::sync::mpsc;
 
 use super::Message;
-use super::pending::PendingWrite;
+use super::pending::Pending;
 use crate::store::Error;
 use crate::store::sql::WriteIntent;
 use crate::store::sqlite::ballast::{BALLAST_BYTES, Ballast, RETRY};
@@ -33,7 +33,7 @@ pub(super) struct CommitBatcher {
 
 /// An operation of a group and what it came to: answered with that once the group is committed, also where it was
 /// refused, as it may have seen what the others had written.
-type Executed = (Box<dyn PendingWrite>, Result<(), Error>);
+type Executed = (Pending, Result<(), Error>);
 
 impl CommitBatcher {
     pub(super) fn new(
@@ -82,7 +82,7 @@ impl CommitBatcher {
 
     /// Runs operations until none waits, commits them together and answers them; a large one alone. Returns what it was
     /// handed and is no part of the group: a large operation, or what is none.
-    async fn group(&mut self, first: Box<dyn PendingWrite>) -> Option<Message> {
+    async fn group(&mut self, first: Pending) -> Option<Message> {
         // Here, and not where one is run again, for which the ballast was given up.
         if self.ballast.is_due() {
             self.cut_log();
@@ -93,17 +93,17 @@ impl CommitBatcher {
         let mut left_over = None;
         let mut group: Vec<Executed> = Vec::new();
         let mut next = Some(first);
-        while let Some(mut operation) = next.take() {
+        while let Some(operation) = next.take() {
             if operation.begins() {
                 let result = match group.is_empty() {
-                    true => self.open(operation.as_mut()).await.map(Ok),
-                    false => self.join(operation.as_mut()).await,
+                    true => self.open(&operation).await.map(Ok),
+                    false => self.join(&operation).await,
                 };
                 match result {
                     Ok(outcome) => group.push((operation, outcome)),
                     // Nothing of anyone else's is in the transaction, or has been seen in it.
                     Err(error) if group.is_empty() => {
-                        let helped = self.with_ballast(operation.as_mut(), error).await;
+                        let helped = self.with_ballast(&operation, error).await;
                         operation.answer(helped);
                     }
                     Err(error) => {
@@ -128,7 +128,7 @@ impl CommitBatcher {
     }
 
     /// Begins a transaction with this operation; without one where it is refused.
-    async fn open(&mut self, operation: &mut dyn PendingWrite) -> Result<(), Error> {
+    async fn open(&mut self, operation: &Pending) -> Result<(), Error> {
         let mut result = self.control(BEGIN);
         if result.is_ok() {
             result = self.run(operation).await;
@@ -141,7 +141,7 @@ impl CommitBatcher {
 
     /// Runs an operation in the transaction of others, which stand whatever becomes of it. An error says that the
     /// transaction is lost.
-    async fn join(&mut self, operation: &mut dyn PendingWrite) -> Result<Result<(), Error>, Error> {
+    async fn join(&mut self, operation: &Pending) -> Result<Result<(), Error>, Error> {
         self.control("SAVEPOINT one")?;
         let outcome = self.run(operation).await;
         if let Err(error) = &outcome {
@@ -172,17 +172,17 @@ impl CommitBatcher {
     /// what one of them broke is not held against the others.
     async fn each_alone(&mut self, group: Vec<Executed>, error: Error) {
         let one = group.len() == 1;
-        for (mut operation, _) in group {
-            let mut committed = if one { Err(error.clone()) } else { self.alone(operation.as_mut()).await };
+        for (operation, _) in group {
+            let mut committed = if one { Err(error.clone()) } else { self.alone(&operation).await };
             if let Err(error) = committed {
-                committed = self.with_ballast(operation.as_mut(), error).await;
+                committed = self.with_ballast(&operation, error).await;
             }
             operation.answer(committed);
         }
     }
 
     /// Runs an operation in a transaction of its own.
-    async fn alone(&mut self, operation: &mut dyn PendingWrite) -> Result<(), Error> {
+    async fn alone(&mut self, operation: &Pending) -> Result<(), Error> {
         self.open(operation).await?;
         let committed = self.end(1);
         if committed.is_err() {
@@ -193,12 +193,12 @@ impl CommitBatcher {
 
     /// Gives the ballast up for an operation that found no room, and runs it again: one that begins something only once
     /// the log is cut and there is ballast beside it again.
-    async fn with_ballast(&mut self, operation: &mut dyn PendingWrite, error: Error) -> Result<(), Error> {
+    async fn with_ballast(&mut self, operation: &Pending, error: Error) -> Result<(), Error> {
         if !self.can_help(&error) || !self.ballast.give_up() {
             return Err(error);
         }
         self.cut_log();
-        let begins = matches!(operation.intent(), WriteIntent::Begins(_));
+        let begins = matches!(operation.intent, WriteIntent::Begins(_));
         if begins && !self.ballast.restore() { Err(error) } else { self.alone(operation).await }
     }
 
@@ -250,8 +250,8 @@ impl CommitBatcher {
 
     /// Runs an operation in the transaction that is open. Without ballast, what is left is for what ends what was
     /// begun: an operation that begins something is refused, unless it finds that it has nothing to write.
-    async fn run(&mut self, operation: &mut dyn PendingWrite) -> Result<(), Error> {
-        let is_bound = matches!(operation.intent(), WriteIntent::Begins(_)) && !self.ballast.restore();
+    async fn run(&mut self, operation: &Pending) -> Result<(), Error> {
+        let is_bound = matches!(operation.intent, WriteIntent::Begins(_)) && !self.ballast.restore();
         let connection = self.connection()?;
         let before = connection.changes();
         operation.run(connection).await?;

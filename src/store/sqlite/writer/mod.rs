@@ -17,11 +17,11 @@ use tokio::sync::{mpsc, oneshot};
 use tokio::time::timeout;
 
 use self::commit_batcher::CommitBatcher;
-use self::pending::{Pending, PendingWrite};
+use self::pending::Pending;
 use super::ballast::Ballast;
-use super::connection::{WriteConnection, WrittenRow};
+use super::connection::WriteConnection;
 use crate::store::Error;
-use crate::store::sql::{self, Operation, Statement, WriteIntent};
+use crate::store::sql::{self, Connection, Operation, Statement, WriteIntent};
 
 /// How long an operation waits for its turn; behind a queue of writes this long, the disk has failed.
 const TURN_TIMEOUT: Duration = Duration::from_secs(60);
@@ -44,7 +44,7 @@ pub(super) struct Writer {
 }
 
 enum Message {
-    Write(Box<dyn PendingWrite>),
+    Write(Pending),
     VacuumPays(oneshot::Sender<Result<bool, Error>>),
     Shorten(oneshot::Sender<()>),
     Close(oneshot::Sender<()>),
@@ -74,14 +74,14 @@ impl Writer {
     }
 
     /// Runs an operation and answers once what it wrote is on the disk.
-    pub(super) async fn write<T: Send + 'static>(
+    pub(super) async fn write(
         &self,
         intent: WriteIntent,
-        operation: Operation<WriteConnection, T>,
-    ) -> Result<T, Error> {
+        operation: Operation<WriteConnection, ()>,
+    ) -> Result<(), Error> {
         let (pending, turn, mut answer) = Pending::new(intent, operation);
         let closed = || Error::Unavailable("the store is closed".into());
-        self.inbox.send(Message::Write(Box::new(pending))).map_err(|_| closed())?;
+        self.inbox.send(Message::Write(pending)).map_err(|_| closed())?;
         loop {
             match timeout(self.turn_timeout, &mut answer).await {
                 Ok(answered) => return answered.unwrap_or_else(|_| Err(closed())),
@@ -94,10 +94,10 @@ impl Writer {
         }
     }
 
-    /// Runs one statement without parameters and returns its rows.
-    pub(super) async fn run(&self, intent: WriteIntent, statement: &'static str) -> Result<Vec<WrittenRow>, Error> {
+    /// Runs one statement without parameters.
+    pub(super) async fn run(&self, intent: WriteIntent, statement: &'static str) -> Result<(), Error> {
         let run = sql::operation(move |connection: &mut WriteConnection| {
-            async move { sql::Connection::rows(connection, Statement::new(statement)).await }.boxed()
+            async move { connection.rows(Statement::new(statement)).await.map(drop) }.boxed()
         });
         self.write(intent, run).await
     }

@@ -5,31 +5,11 @@ use std::sync::Arc;
 use std::sync::atomic::{AtomicU8, Ordering};
 
 use futures_util::FutureExt;
-use futures_util::future::BoxFuture;
 use tokio::sync::oneshot;
 
 use super::{LARGE_BYTES, WriteConnection};
 use crate::store::Error;
 use crate::store::sql::{Operation, WriteIntent};
-
-/// An operation that waits for its turn, whatever it answers.
-pub(super) trait PendingWrite: Send {
-    /// Marks it as begun; `false` where its caller is gone, and nobody wants it any more.
-    fn begins(&self) -> bool;
-
-    fn intent(&self) -> WriteIntent;
-
-    /// Whether it is to have a commit of its own.
-    fn is_large(&self) -> bool {
-        self.intent().bytes() > LARGE_BYTES
-    }
-
-    /// Runs it within the transaction and keeps its answer. It may be run again where the transaction came to nothing.
-    fn run<'c>(&'c mut self, connection: &'c mut WriteConnection) -> BoxFuture<'c, Result<(), Error>>;
-
-    /// Answers its caller: with what it kept, or why nothing was written.
-    fn answer(self: Box<Self>, committed: Result<(), Error>);
-}
 
 /// Whether an operation has begun, or its caller has given it up: whichever comes first.
 #[derive(Debug, Default)]
@@ -55,51 +35,47 @@ impl Turn {
     }
 }
 
-pub(super) struct Pending<T> {
-    operation: Operation<WriteConnection, T>,
-    intent: WriteIntent,
-    value: Option<T>,
+/// An operation that waits for its turn.
+pub(super) struct Pending {
+    operation: Operation<WriteConnection, ()>,
+    pub(super) intent: WriteIntent,
     turn: Arc<Turn>,
-    reply: oneshot::Sender<Result<T, Error>>,
+    reply: oneshot::Sender<Result<(), Error>>,
 }
 
-impl<T> Pending<T> {
+impl Pending {
     /// With the turn that its caller may give up, and where its answer comes.
     pub(super) fn new(
         intent: WriteIntent,
-        operation: Operation<WriteConnection, T>,
-    ) -> (Self, Arc<Turn>, oneshot::Receiver<Result<T, Error>>) {
+        operation: Operation<WriteConnection, ()>,
+    ) -> (Self, Arc<Turn>, oneshot::Receiver<Result<(), Error>>) {
         let turn = Arc::new(Turn::default());
         let (reply, answer) = oneshot::channel();
-        (Self { operation, intent, value: None, turn: turn.clone(), reply }, turn, answer)
+        (Self { operation, intent, turn: turn.clone(), reply }, turn, answer)
     }
-}
 
-impl<T: Send + 'static> PendingWrite for Pending<T> {
-    fn begins(&self) -> bool {
+    /// Marks it as begun; `false` where its caller is gone, and nobody wants it any more.
+    pub(super) fn begins(&self) -> bool {
         self.turn.begin() && !self.reply.is_closed()
     }
 
-    fn intent(&self) -> WriteIntent {
-        self.intent
+    /// Whether it is to have a commit of its own.
+    pub(super) fn is_large(&self) -> bool {
+        self.intent.bytes() > LARGE_BYTES
     }
 
-    fn run<'c>(&'c mut self, connection: &'c mut WriteConnection) -> BoxFuture<'c, Result<(), Error>> {
-        Box::pin(async {
-            // A defect in one operation must not cost the others their writer, be it in its call or in what it awaits.
-            let run = async { (self.operation)(connection).await };
-            let outcome = AssertUnwindSafe(run).catch_unwind().await;
-            let value = outcome.unwrap_or_else(|_| Err(Error::Corrupt("an operation of the store panicked".into())))?;
-            self.value = Some(value);
-            Ok(())
-        })
+    /// Runs it within the transaction. It may be run again where the transaction came to nothing.
+    pub(super) async fn run(&self, connection: &mut WriteConnection) -> Result<(), Error> {
+        // A defect in one operation must not cost the others their writer, be it in its call or in what it awaits.
+        let run = async { (self.operation)(connection).await };
+        let outcome = AssertUnwindSafe(run).catch_unwind().await;
+        outcome.unwrap_or_else(|_| Err(Error::Corrupt("an operation of the store panicked".into())))
     }
 
-    fn answer(self: Box<Self>, committed: Result<(), Error>) {
-        let Self { value, reply, .. } = *self;
-        let missing = || Error::Corrupt("an operation was committed without an answer".into());
+    /// Answers its caller: what it wrote is on the disk, or why nothing was written.
+    pub(super) fn answer(self, committed: Result<(), Error>) {
         // A caller that went away does not need to know.
-        let _ = reply.send(committed.and_then(|()| value.ok_or_else(missing)));
+        let _ = self.reply.send(committed);
     }
 }
 
