@@ -22,7 +22,7 @@ impl Client {
         settings: &SolveSettings,
         options: &JobOptions,
     ) -> Result<Vec<Job>, Error> {
-        let inline = inputs.map(|input| JobInput::TrackSet(convert::input::to_wire(input)));
+        let inline = inputs.map(|input| JobInput::TrackSet(convert::input::to_wire(input.clone())));
         let named = uploaded.iter().map(|name| JobInput::Input(name.to_string()));
         let requests = (1..).zip(inline.chain(named)).map(|(number, input)| {
             let request_id = options.request_id.as_ref().map(|id| format!("{id}-{number}"));

@@ -3,13 +3,14 @@
 use std::sync::Arc;
 
 use crate::domain::{RawInput, RawMatches};
+use crate::rpc::convert::set::Set;
 use crate::rpc::convert::{input, matches};
 use crate::rpc::proto::{self, create_job_request::Source, input_data::Data, solve_request::Message};
 
 /// An input as it is sent.
 #[derive(Debug, Clone)]
 pub enum InputData {
-    TrackSet(Arc<RawInput>),
+    TrackSet(Arc<proto::TrackSet>),
     MatchSet(Arc<proto::MatchSet>),
 }
 
@@ -21,7 +22,7 @@ impl From<&RawInput> for InputData {
 
 impl From<RawInput> for InputData {
     fn from(raw: RawInput) -> Self {
-        Self::TrackSet(Arc::new(raw))
+        Self::TrackSet(Arc::new(input::to_wire(raw)))
     }
 }
 
@@ -35,7 +36,7 @@ impl InputData {
     /// The whole, as a job is created with it.
     pub(super) fn into_source(self) -> Source {
         match self {
-            Self::TrackSet(raw) => Source::TrackSet(input::to_wire(&raw)),
+            Self::TrackSet(set) => Source::TrackSet(Arc::unwrap_or_clone(set)),
             Self::MatchSet(set) => Source::MatchSet(Arc::unwrap_or_clone(set)),
         }
     }
@@ -43,7 +44,7 @@ impl InputData {
     /// The whole, as it is uploaded.
     pub(super) fn into_data(self) -> Data {
         match self {
-            Self::TrackSet(raw) => Data::TrackSet(input::to_wire(&raw)),
+            Self::TrackSet(set) => Data::TrackSet(Arc::unwrap_or_clone(set)),
             Self::MatchSet(set) => Data::MatchSet(Arc::unwrap_or_clone(set)),
         }
     }
@@ -51,18 +52,19 @@ impl InputData {
     /// What precedes [`chunks`](Self::chunks).
     pub(super) fn head(&self) -> Source {
         match self {
-            Self::TrackSet(raw) => Source::TrackSet(input::head_to_wire(raw)),
-            Self::MatchSet(set) => Source::MatchSet(matches::head(set)),
+            Self::TrackSet(set) => Source::TrackSet(set.head()),
+            Self::MatchSet(set) => Source::MatchSet(set.head()),
         }
     }
 
     /// What follows the head.
     pub(super) fn chunks(&self) -> Box<dyn Iterator<Item = Message> + Send> {
-        match self {
-            Self::TrackSet(raw) => Box::new(input::chunks(Arc::clone(raw)).map(Message::TrackSetChunk)),
+        match self.clone() {
+            Self::TrackSet(set) => {
+                Box::new((0..).map_while(move |number| set.chunk(number)).map(Message::TrackSetChunk))
+            }
             Self::MatchSet(set) => {
-                let set = Arc::clone(set);
-                Box::new((0..).map_while(move |number| matches::chunk(&set, number)).map(Message::MatchSetChunk))
+                Box::new((0..).map_while(move |number| set.chunk(number)).map(Message::MatchSetChunk))
             }
         }
     }

@@ -8,7 +8,7 @@ use tracing::Instrument;
 
 use super::caller::Caller;
 use super::convert::create::{self, Description};
-use super::convert::input::Draft;
+use super::convert::input::{Draft, field_of};
 use super::inflight::{Permit, WORKING_COPIES};
 use super::{proto, status};
 use crate::domain::job::Job;
@@ -16,6 +16,7 @@ use crate::domain::{InputName, InvalidInput, Limits, Violation};
 use crate::engine::{self, Engine, JobInput, NewJob};
 use crate::telemetry::metrics::{Refusal, refused};
 use proto::create_job_request::Source as Inline;
+use proto::solve_request::Message;
 
 /// How long a stream may be silent before its input is complete. A dead connection is found by keep-alive long before;
 /// this is for a caller that lives and forgets.
@@ -68,22 +69,12 @@ impl Submission {
     /// `INVALID_ARGUMENT` for a chunk of the wrong kind, a second config, or more than the limits allow;
     /// `RESOURCE_EXHAUSTED` for want of memory.
     pub fn append(&mut self, message: proto::SolveRequest) -> Result<(), Status> {
-        use proto::solve_request::Message;
         match (message.message, &mut self.input) {
             (Some(Message::Config(_)), _) => Err(Violation::of("config", "comes once, in the first message").into()),
             (None, _) => Err(Violation::of("message", "is not set").into()),
-            (Some(Message::TrackSetChunk(chunk)), Source::Draft(draft)) => draft.append_track_set(chunk),
-            (Some(Message::MeasurementMatrixChunk(chunk)), Source::Draft(draft)) => draft.append_matrix(chunk),
-            (Some(Message::MatchSetChunk(chunk)), Source::Draft(draft)) => draft.append_match_set(chunk),
-            (Some(message), Source::Uploaded(_)) => {
-                let field = match message {
-                    Message::TrackSetChunk(_) => "track_set_chunk",
-                    Message::MeasurementMatrixChunk(_) => "measurement_matrix_chunk",
-                    Message::MatchSetChunk(_) => "match_set_chunk",
-                    // Refused above.
-                    Message::Config(_) => "config",
-                };
-                Err(Violation::of(field, "the config names an uploaded input").into())
+            (Some(chunk), Source::Draft(draft)) => draft.append(chunk),
+            (Some(chunk), Source::Uploaded(_)) => {
+                Err(Violation::of(field_of(&chunk), "the config names an uploaded input").into())
             }
         }
         .map_err(invalid)?;

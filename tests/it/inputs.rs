@@ -57,7 +57,7 @@ async fn a_deleted_input_leaves_the_list_and_the_jobs_that_have_it_go_on() {
     let running = created(&mut jobs, named()).await;
     reaches(&mut jobs, &running, &[JobState::Running]).await;
     let waiting = created(&mut jobs, named()).await;
-    let inline = created(&mut jobs, create(Source::TrackSet(scpsfm::rpc::convert::input::to_wire(&raw(3, 40))))).await;
+    let inline = created(&mut jobs, create(Source::TrackSet(scpsfm::rpc::convert::input::to_wire(raw(3, 40))))).await;
     inputs.delete_input(deletion(&stored[0].name)).await.expect("deleted");
     // Each tells what it was created with, also now.
     let listed = proto::ListJobsRequest { parent: DEFAULT.into(), ..Default::default() };

@@ -2,7 +2,7 @@
 
 use std::path::{Path, PathBuf};
 
-use scpsfm::rpc::convert::matches;
+use scpsfm::rpc::convert::set::Set;
 use scpsfm::rpc::proto::job_service_client::JobServiceClient;
 use scpsfm::rpc::proto::{self, create_job_request::Source, solve_request::Message};
 use serde_json::Value;
@@ -172,8 +172,8 @@ async fn matches_are_the_same_tracks_however_they_come() {
     assert_eq!(joined, expected);
 
     let set = match_set();
-    let head = Message::Config(create(Source::MatchSet(matches::head(&set))));
-    let chunks = (0..).map_while(|number| matches::chunk(&set, number)).map(Message::MatchSetChunk);
+    let head = Message::Config(create(Source::MatchSet(set.head())));
+    let chunks = (0..).map_while(|number| set.chunk(number)).map(Message::MatchSetChunk);
     let messages: Vec<_> = std::iter::once(head).chain(chunks).map(solve_request).collect();
     assert_eq!(messages.len(), 2);
     let answer = server.calibration().await.solve(tokio_stream::iter(messages)).await.expect("a solve");

@@ -1,21 +1,15 @@
 //! Inputs as they arrive, in one message or in chunks, and as a client sends them.
 
-use std::borrow::Borrow;
-
+use super::set::Set;
 use super::{matches, matrix, size_to_wire};
 use crate::domain::{FocalPrior, ImageSize, Input, InvalidInput, Limits, RawInput, View, Violation};
 use crate::engine::StoredInput;
 use crate::rpc::proto;
 use proto::create_job_request::Source as Inline;
-
-/// Name of a track set in violations.
-const TRACK_SET: &str = "track_set";
+use proto::solve_request::Message;
 
 /// Bytes of an observation in memory at most: a view, a track, and four reals.
 pub const OBSERVATION_BYTES: u64 = 2 * 4 + 4 * 8;
-
-/// Observations in one chunk that a client sends: at most 2.8 MB, well below any server's message limit.
-const CHUNK_OBSERVATIONS: usize = 65_536;
 
 /// An input that may not be complete yet. Never holds more than the limits allow and one message on top.
 #[derive(Debug)]
@@ -31,19 +25,13 @@ enum Body {
     Matches(proto::MatchSet),
 }
 
-impl Body {
-    /// Its name in a request.
-    fn name(&self) -> &'static str {
-        match self {
-            Body::TrackSet(_) => TRACK_SET,
-            Body::Matrix(_) => matrix::MATRIX,
-            Body::Matches(_) => matches::MATCH_SET,
-        }
-    }
-
-    /// The refusal of a chunk of another kind.
-    fn is_no(&self, chunk: &str) -> InvalidInput {
-        Violation::of(chunk, format!("the config holds a {}", self.name())).into()
+/// The field of a message that follows the config.
+pub fn field_of(message: &Message) -> &'static str {
+    match message {
+        Message::Config(_) => "config",
+        Message::TrackSetChunk(_) => "track_set_chunk",
+        Message::MeasurementMatrixChunk(_) => "measurement_matrix_chunk",
+        Message::MatchSetChunk(_) => "match_set_chunk",
     }
 }
 
@@ -68,43 +56,24 @@ impl Draft {
         Ok(Self { body, limits: limits.clone() })
     }
 
-    /// Appends observations.
+    /// Appends a chunk.
     ///
     /// # Errors
     /// A violation where the input is of another kind; see [`Draft::check_size`].
-    pub fn append_track_set(&mut self, mut chunk: proto::TrackSetChunk) -> Result<(), InvalidInput> {
-        let Body::TrackSet(set) = &mut self.body else {
-            return Err(self.body.is_no("track_set_chunk"));
-        };
-        set.view_indices.append(&mut chunk.view_indices);
-        set.track_indices.append(&mut chunk.track_indices);
-        set.xs.append(&mut chunk.xs);
-        set.ys.append(&mut chunk.ys);
-        set.sigmas_px.append(&mut chunk.sigmas_px);
-        set.depths.append(&mut chunk.depths);
-        Ok(())
-    }
-
-    /// Appends numbers and visibility.
-    ///
-    /// # Errors
-    /// A violation where the input is of another kind; see [`Draft::check_size`].
-    pub fn append_matrix(&mut self, mut chunk: proto::MeasurementMatrixChunk) -> Result<(), InvalidInput> {
-        let Body::Matrix(matrix) = &mut self.body else {
-            return Err(self.body.is_no("measurement_matrix_chunk"));
-        };
-        matrix.values.append(&mut chunk.values);
-        matrix.visibility.append(&mut chunk.visibility);
-        Ok(())
-    }
-
-    /// Appends keypoints, pairs and matches.
-    ///
-    /// # Errors
-    /// A violation where the input is of another kind; see [`Draft::check_size`].
-    pub fn append_match_set(&mut self, chunk: proto::MatchSetChunk) -> Result<(), InvalidInput> {
-        let Body::Matches(set) = &mut self.body else { return Err(self.body.is_no("match_set_chunk")) };
-        matches::append(set, chunk);
+    pub fn append(&mut self, message: Message) -> Result<(), InvalidInput> {
+        match (&mut self.body, message) {
+            (Body::TrackSet(set), Message::TrackSetChunk(chunk)) => set.append(chunk),
+            (Body::Matrix(matrix), Message::MeasurementMatrixChunk(chunk)) => matrix.append(chunk),
+            (Body::Matches(set), Message::MatchSetChunk(chunk)) => set.append(chunk),
+            (body, other) => {
+                let kind = match body {
+                    Body::TrackSet(_) => proto::TrackSet::NAME,
+                    Body::Matrix(_) => proto::MeasurementMatrix::NAME,
+                    Body::Matches(_) => proto::MatchSet::NAME,
+                };
+                return Err(Violation::of(field_of(&other), format!("the config holds a {kind}")).into());
+            }
+        }
         Ok(())
     }
 
@@ -115,34 +84,18 @@ impl Draft {
     /// A violation of the first field that is too long.
     pub fn check_size(&self) -> Result<(), InvalidInput> {
         match &self.body {
-            Body::TrackSet(set) => check_track_set_size(set, &self.limits),
+            Body::TrackSet(set) => set.check_counts(&self.limits),
             Body::Matrix(matrix) => matrix::check_size(matrix, &self.limits),
-            Body::Matches(set) => matches::check_size(set, &self.limits),
+            Body::Matches(set) => set.check_counts(&self.limits),
         }
     }
 
-    /// Bytes that its arrays take in memory; those of matches count as often as joining needs them.
+    /// Bytes that it takes in memory, see [`Set::bytes`].
     pub fn bytes(&self) -> u64 {
-        fn of<T>(array: &Vec<T>) -> u64 {
-            (array.capacity() * size_of::<T>()) as u64
-        }
         match &self.body {
-            Body::TrackSet(set) => {
-                let reals = [&set.xs, &set.ys, &set.sigmas_px, &set.depths].map(of).into_iter().sum::<u64>();
-                of(&set.views) + of(&set.view_indices) + of(&set.track_indices) + reals
-            }
-            Body::Matrix(matrix) => of(&matrix.views) + of(&matrix.values) + of(&matrix.visibility),
-            Body::Matches(set) => {
-                let pairs = [&set.first_view_indices, &set.second_view_indices, &set.match_counts];
-                let matches =
-                    [&set.first_keypoint_indices, &set.second_keypoint_indices].map(of).into_iter().sum::<u64>();
-                of(&set.views)
-                    + of(&set.keypoint_counts)
-                    + of(&set.xs)
-                    + of(&set.ys)
-                    + pairs.map(of).into_iter().sum::<u64>()
-                    + matches::JOINING_COPIES * matches
-            }
+            Body::TrackSet(set) => set.bytes(),
+            Body::Matrix(matrix) => matrix.bytes(),
+            Body::Matches(set) => set.bytes(),
         }
     }
 
@@ -152,34 +105,10 @@ impl Draft {
     /// Every violation found, by field and index.
     pub fn finish(self) -> Result<Input, InvalidInput> {
         match self.body {
-            Body::TrackSet(set) => Input::new(track_set_to_raw(set), &self.limits, TRACK_SET),
+            Body::TrackSet(set) => Input::new(track_set_to_raw(set), &self.limits, proto::TrackSet::NAME),
             Body::Matrix(matrix) => matrix::to_input(matrix, &self.limits),
-            Body::Matches(set) => matches::to_raw(set).into_input(&self.limits, matches::MATCH_SET),
+            Body::Matches(set) => matches::to_raw(set).into_input(&self.limits, proto::MatchSet::NAME),
         }
-    }
-}
-
-pub(super) fn check_track_set_size(set: &proto::TrackSet, limits: &Limits) -> Result<(), InvalidInput> {
-    let lengths = [
-        ("views", set.views.len(), limits.max_views),
-        ("track_count", set.track_count as usize, limits.max_tracks),
-        ("view_indices", set.view_indices.len(), limits.max_observations),
-        ("track_indices", set.track_indices.len(), limits.max_observations),
-        ("xs", set.xs.len(), limits.max_observations),
-        ("ys", set.ys.len(), limits.max_observations),
-        ("sigmas_px", set.sigmas_px.len(), limits.max_observations),
-        ("depths", set.depths.len(), limits.max_observations),
-    ];
-    within(TRACK_SET, &lengths)
-}
-
-/// Refuses the first of `(field, count, limit)` that is above its limit.
-pub(super) fn within(prefix: &str, counts: &[(&str, usize, usize)]) -> Result<(), InvalidInput> {
-    match counts.iter().find(|(_, count, limit)| count > limit) {
-        Some((field, count, limit)) => {
-            Err(Violation::of(format!("{prefix}.{field}"), format!("{count} are above the limit of {limit}")).into())
-        }
-        None => Ok(()),
     }
 }
 
@@ -218,51 +147,19 @@ pub(super) fn view_to_wire(view: &View) -> proto::View {
     }
 }
 
-/// Counts and views of an input, without its observations: what precedes [`chunks`].
-pub fn head_to_wire(raw: &RawInput) -> proto::TrackSet {
+/// A whole input in one message.
+pub fn to_wire(raw: RawInput) -> proto::TrackSet {
     proto::TrackSet {
         // A count that does not fit is above every server's limit; saturated, it is refused there with its sentence.
         track_count: u32::try_from(raw.track_count).unwrap_or(u32::MAX),
         views: raw.views.iter().map(view_to_wire).collect(),
-        ..proto::TrackSet::default()
+        view_indices: raw.view,
+        track_indices: raw.track,
+        xs: raw.x,
+        ys: raw.y,
+        depths: raw.depth,
+        sigmas_px: raw.sigma,
     }
-}
-
-/// A whole input in one message.
-pub fn to_wire(raw: &RawInput) -> proto::TrackSet {
-    proto::TrackSet {
-        view_indices: raw.view.clone(),
-        track_indices: raw.track.clone(),
-        xs: raw.x.clone(),
-        ys: raw.y.clone(),
-        depths: raw.depth.clone(),
-        sigmas_px: raw.sigma.clone(),
-        ..head_to_wire(raw)
-    }
-}
-
-/// The observations of an input in chunks. Arrays of unequal lengths are sent as they are: the server says what is
-/// wrong with them.
-pub fn chunks<R: Borrow<RawInput>>(raw: R) -> impl Iterator<Item = proto::TrackSetChunk> {
-    fn slice<T: Clone>(values: &[T], from: usize) -> Vec<T> {
-        values.iter().skip(from).take(CHUNK_OBSERVATIONS).cloned().collect()
-    }
-    let longest = {
-        let raw = raw.borrow();
-        let lengths = [raw.view.len(), raw.track.len(), raw.x.len(), raw.y.len(), raw.depth.len(), raw.sigma.len()];
-        lengths.into_iter().max().unwrap_or(0)
-    };
-    (0..longest).step_by(CHUNK_OBSERVATIONS).map(move |from| {
-        let raw = raw.borrow();
-        proto::TrackSetChunk {
-            view_indices: slice(&raw.view, from),
-            track_indices: slice(&raw.track, from),
-            xs: slice(&raw.x, from),
-            ys: slice(&raw.y, from),
-            sigmas_px: slice(&raw.sigma, from),
-            depths: slice(&raw.depth, from),
-        }
-    })
 }
 
 /// An uploaded input.
@@ -280,6 +177,7 @@ pub fn uploaded_to_wire(input: &StoredInput) -> proto::Input {
 
 #[cfg(test)]
 mod tests {
+    use super::super::set::CHUNK_ENTRIES;
     use super::*;
 
     fn raw(observations: usize) -> RawInput {
@@ -303,18 +201,19 @@ mod tests {
 
     #[test]
     fn chunks_add_up_to_the_whole() {
-        let raw = raw(CHUNK_OBSERVATIONS + 7);
+        let raw = raw(CHUNK_ENTRIES + 7);
         let limits = Limits::default();
-        let mut draft = Draft::begin(Some(Inline::TrackSet(head_to_wire(&raw))), &limits).expect("a head");
+        let set = to_wire(raw.clone());
+        let mut draft = Draft::begin(Some(Inline::TrackSet(set.head())), &limits).expect("a head");
         let mut count = 0;
-        for chunk in chunks(&raw) {
-            draft.append_track_set(chunk).expect("a chunk");
+        while let Some(chunk) = set.chunk(count) {
+            draft.append(Message::TrackSetChunk(chunk)).expect("a chunk");
             draft.check_size().expect("within the limits");
             count += 1;
         }
         assert_eq!(count, 2);
-        let whole = Draft::begin(Some(Inline::TrackSet(to_wire(&raw))), &limits).expect("a whole");
-        let expected = Input::new(raw, &limits, TRACK_SET).expect("valid");
+        let whole = Draft::begin(Some(Inline::TrackSet(set)), &limits).expect("a whole");
+        let expected = Input::new(raw, &limits, proto::TrackSet::NAME).expect("valid");
         assert_eq!(draft.finish().expect("valid"), expected);
         assert_eq!(whole.finish().expect("valid"), expected);
     }
@@ -322,11 +221,11 @@ mod tests {
     #[test]
     fn an_endless_stream_is_refused_as_soon_as_it_is_above_the_limits() {
         let limits = Limits { max_observations: 10, ..Limits::default() };
-        let mut draft = Draft::begin(Some(Inline::TrackSet(head_to_wire(&raw(4)))), &limits).expect("a head");
+        let mut draft = Draft::begin(Some(Inline::TrackSet(to_wire(raw(4)).head())), &limits).expect("a head");
         let chunk = proto::TrackSetChunk { ys: vec![0.0; 6], ..Default::default() };
-        draft.append_track_set(chunk.clone()).expect("a chunk");
+        draft.append(Message::TrackSetChunk(chunk.clone())).expect("a chunk");
         assert_eq!(draft.check_size(), Ok(()));
-        draft.append_track_set(chunk).expect("a chunk");
+        draft.append(Message::TrackSetChunk(chunk)).expect("a chunk");
         let error = draft.check_size().expect_err("12 of 10");
         assert_eq!(error.to_string(), "track_set.ys: 12 are above the limit of 10");
     }
@@ -334,14 +233,14 @@ mod tests {
     #[test]
     fn a_chunk_of_the_other_kind_is_refused() {
         let limits = Limits::default();
-        let mut draft = Draft::begin(Some(Inline::TrackSet(head_to_wire(&raw(4)))), &limits).expect("a head");
-        let error = draft.append_matrix(proto::MeasurementMatrixChunk::default()).expect_err("another kind");
+        let mut draft = Draft::begin(Some(Inline::TrackSet(to_wire(raw(4)).head())), &limits).expect("a head");
+        let error = draft.append(Message::MeasurementMatrixChunk(Default::default())).expect_err("another kind");
         assert_eq!(error.to_string(), "measurement_matrix_chunk: the config holds a track_set");
     }
 
     #[test]
     fn wrong_sigmas_name_their_index() {
-        let mut set = to_wire(&raw(4));
+        let mut set = to_wire(raw(4));
         set.sigmas_px = vec![1.0, 0.5, f64::NAN, 1.0];
         let finish = |set| Draft::begin(Some(Inline::TrackSet(set)), &Limits::default()).expect("set").finish();
         let error = finish(set.clone()).expect_err("NaN");

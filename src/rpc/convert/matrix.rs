@@ -1,13 +1,14 @@
 //! Measurement matrices: checked in their own terms, then read as observations, padding stripped.
 
-use super::input::{view_from_wire, within};
+use super::input::view_from_wire;
+use super::set::{Set, within};
 use crate::domain::error::Violations;
 use crate::domain::input::too_few_views;
 use crate::domain::{Input, InvalidInput, Limits, RawInput, View, Violation};
 use crate::rpc::proto;
 
 /// Name of a matrix in violations.
-pub(super) const MATRIX: &str = "measurement_matrix";
+const MATRIX: &str = proto::MeasurementMatrix::NAME;
 
 fn field(name: &str) -> String {
     format!("{MATRIX}.{name}")
@@ -17,14 +18,7 @@ fn field(name: &str) -> String {
 /// mostly holes is a track set.
 pub(super) fn check_size(matrix: &proto::MeasurementMatrix, limits: &Limits) -> Result<(), InvalidInput> {
     let (n, m) = (matrix.view_count as usize, matrix.track_count as usize);
-    within(
-        MATRIX,
-        &[
-            ("view_count", n, limits.max_views),
-            ("track_count", m, limits.max_tracks),
-            ("views", matrix.views.len(), limits.max_views),
-        ],
-    )?;
+    within(MATRIX, matrix.claims(limits))?;
     // In u64, since two counts within their limits may still overflow 32 bits together.
     let entries = n as u64 * m as u64;
     if entries > limits.max_observations as u64 {

@@ -15,6 +15,7 @@ pub mod names;
 pub mod progress;
 pub mod result;
 mod second_structures;
+pub mod set;
 pub mod settings;
 mod time;
 pub mod upload;

@@ -1,12 +1,11 @@
 //! An uploaded input, decoded as its bytes come by. What is decoded never grows beyond the limits on inputs, whatever
 //! the bytes say: prost's own decoding would take fifteen times their length for the worst of them.
 
-use prost::Message;
 use prost::bytes::Buf;
 use prost::encoding::{DecodeContext, WireType, decode_key, decode_varint, skip_field};
 
-use super::input::{self, Draft, within};
-use super::matches;
+use super::input::Draft;
+use super::set::{Array, Set, max_entries};
 use crate::domain::{InvalidInput, Limits, Violation};
 use crate::rpc::proto;
 use proto::create_job_request::Source as Inline;
@@ -26,30 +25,27 @@ pub fn read(buf: &mut impl Buf, limits: &Limits) -> Result<Draft, InvalidInput> 
     while buf.has_remaining() {
         let (tag, wire) = decode_key(buf).map_err(malformed)?;
         // The last kind wins, and a kind that comes again is merged, as everywhere in protobuf.
-        match (tag, wire, body.take()) {
+        body = match (tag, wire, body.take()) {
             (1, WireType::LengthDelimited, before) => {
-                let mut set = if let Some(Inline::TrackSet(set)) = before { set } else { proto::TrackSet::default() };
-                nested(buf, |buf, tag, wire| track_set_field(buf, tag, wire, &mut set, limits))?;
-                body = Some(Inline::TrackSet(set));
+                let before = if let Some(Inline::TrackSet(set)) = before { set } else { proto::TrackSet::default() };
+                Some(Inline::TrackSet(merged(buf, before, limits)?))
             }
             (2, WireType::LengthDelimited, before) => {
-                let mut matrix = match before {
+                let before = match before {
                     Some(Inline::MeasurementMatrix(matrix)) => matrix,
                     _ => proto::MeasurementMatrix::default(),
                 };
-                nested(buf, |buf, tag, wire| matrix_field(buf, tag, wire, &mut matrix, limits))?;
-                body = Some(Inline::MeasurementMatrix(matrix));
+                Some(Inline::MeasurementMatrix(merged(buf, before, limits)?))
             }
             (3, WireType::LengthDelimited, before) => {
-                let mut set = if let Some(Inline::MatchSet(set)) = before { set } else { proto::MatchSet::default() };
-                nested(buf, |buf, tag, wire| match_set_field(buf, tag, wire, &mut set, limits))?;
-                body = Some(Inline::MatchSet(set));
+                let before = if let Some(Inline::MatchSet(set)) = before { set } else { proto::MatchSet::default() };
+                Some(Inline::MatchSet(merged(buf, before, limits)?))
             }
             (_, _, before) => {
-                body = before;
                 skip_field(wire, tag, buf, DecodeContext::default()).map_err(malformed)?;
+                before
             }
-        }
+        };
     }
     let draft = Draft::begin(body, limits)?;
     draft.check_size()?;
@@ -69,94 +65,34 @@ fn length(buf: &mut impl Buf) -> Result<usize, InvalidInput> {
     }
 }
 
-/// Decodes the fields of a message within the message.
-fn nested<B: Buf>(
-    buf: &mut B,
-    mut field: impl FnMut(&mut B, u32, WireType) -> Result<(), InvalidInput>,
-) -> Result<(), InvalidInput> {
+/// A set with the fields of a message within the message.
+fn merged<S: Set>(buf: &mut impl Buf, mut set: S, limits: &Limits) -> Result<S, InvalidInput> {
     let length = length(buf)?;
     let end = buf.remaining() - length;
     while buf.remaining() > end {
         let (tag, wire) = decode_key(buf).map_err(malformed)?;
-        field(buf, tag, wire)?;
-    }
-    if buf.remaining() == end { Ok(()) } else { Err(malformed("a field is longer than its message")) }
-}
-
-fn track_set_field(
-    buf: &mut impl Buf,
-    tag: u32,
-    wire: WireType,
-    set: &mut proto::TrackSet,
-    limits: &Limits,
-) -> Result<(), InvalidInput> {
-    let max = limits.max_observations;
-    let packed = wire == WireType::LengthDelimited;
-    match tag {
-        3 if packed => integers(buf, &mut set.view_indices, "track_set.view_indices", max),
-        4 if packed => integers(buf, &mut set.track_indices, "track_set.track_indices", max),
-        5 if packed => doubles(buf, &mut set.xs, "track_set.xs", max),
-        6 if packed => doubles(buf, &mut set.ys, "track_set.ys", max),
-        7 if packed => doubles(buf, &mut set.sigmas_px, "track_set.sigmas_px", max),
-        8 if packed => doubles(buf, &mut set.depths, "track_set.depths", max),
-        _ => {
-            set.merge_field(tag, wire, buf, DecodeContext::default()).map_err(malformed)?;
-            input::check_track_set_size(set, limits)
+        match set.array(tag).filter(|_| wire == WireType::LengthDelimited) {
+            Some((name, array)) => decode_array(buf, array, &format!("{}.{name}", S::NAME), max_entries(name, limits))?,
+            None => {
+                set.merge_field(tag, wire, buf, DecodeContext::default()).map_err(malformed)?;
+                set.check_counts(limits)?;
+            }
         }
     }
+    if buf.remaining() == end { Ok(set) } else { Err(malformed("a field is longer than its message")) }
 }
 
-fn matrix_field(
-    buf: &mut impl Buf,
-    tag: u32,
-    wire: WireType,
-    matrix: &mut proto::MeasurementMatrix,
-    limits: &Limits,
-) -> Result<(), InvalidInput> {
-    let max = limits.max_observations;
-    match tag {
-        3 if wire == WireType::LengthDelimited => {
-            doubles(buf, &mut matrix.values, "measurement_matrix.values", max.saturating_mul(3))
-        }
-        5 if wire == WireType::LengthDelimited => {
+/// Adds the entries of a packed array.
+fn decode_array(buf: &mut impl Buf, array: Array<'_>, field: &str, max: usize) -> Result<(), InvalidInput> {
+    match array {
+        Array::Integers(entries) => integers(buf, entries, field, max),
+        Array::Reals(entries) => doubles(buf, entries, field, max),
+        Array::Bytes(entries) => {
             let length = length(buf)?;
-            check("measurement_matrix.visibility", length, max)?;
-            matrix.visibility = vec![0; length];
-            buf.copy_to_slice(&mut matrix.visibility);
+            check(field, length, max)?;
+            *entries = vec![0; length];
+            buf.copy_to_slice(entries);
             Ok(())
-        }
-        _ => {
-            matrix.merge_field(tag, wire, buf, DecodeContext::default()).map_err(malformed)?;
-            let counts = [
-                ("values", matrix.values.len(), max.saturating_mul(3)),
-                ("views", matrix.views.len(), limits.max_views),
-            ];
-            within("measurement_matrix", &counts)
-        }
-    }
-}
-
-fn match_set_field(
-    buf: &mut impl Buf,
-    tag: u32,
-    wire: WireType,
-    set: &mut proto::MatchSet,
-    limits: &Limits,
-) -> Result<(), InvalidInput> {
-    let most = limits.max_observations;
-    let packed = wire == WireType::LengthDelimited;
-    match tag {
-        2 if packed => integers(buf, &mut set.keypoint_counts, "match_set.keypoint_counts", limits.max_views),
-        3 if packed => doubles(buf, &mut set.xs, "match_set.xs", most),
-        4 if packed => doubles(buf, &mut set.ys, "match_set.ys", most),
-        5 if packed => integers(buf, &mut set.first_view_indices, "match_set.first_view_indices", most),
-        6 if packed => integers(buf, &mut set.second_view_indices, "match_set.second_view_indices", most),
-        7 if packed => integers(buf, &mut set.match_counts, "match_set.match_counts", most),
-        8 if packed => integers(buf, &mut set.first_keypoint_indices, "match_set.first_keypoint_indices", most),
-        9 if packed => integers(buf, &mut set.second_keypoint_indices, "match_set.second_keypoint_indices", most),
-        _ => {
-            set.merge_field(tag, wire, buf, DecodeContext::default()).map_err(malformed)?;
-            matches::check_size(set, limits)
         }
     }
 }
@@ -197,6 +133,8 @@ fn integers(buf: &mut impl Buf, values: &mut Vec<u32>, field: &str, max: usize) 
 
 #[cfg(test)]
 mod tests {
+    use prost::Message;
+
     use super::*;
     use crate::domain::RawInput;
 
@@ -237,7 +175,7 @@ mod tests {
     }
 
     fn track_set(observations: u32) -> Vec<u8> {
-        encoded(proto::input_data::Data::TrackSet(super::super::input::to_wire(&raw(observations))))
+        encoded(proto::input_data::Data::TrackSet(super::super::input::to_wire(raw(observations))))
     }
 
     #[test]

@@ -5,6 +5,7 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use scpsfm::rpc::convert;
+use scpsfm::rpc::convert::set::Set;
 use scpsfm::rpc::proto::calibration_service_client::CalibrationServiceClient;
 use scpsfm::rpc::proto::job_service_client::JobServiceClient;
 use scpsfm::rpc::proto::{self, JobState, create_job_request::Source, solve_request::Message};
@@ -47,9 +48,9 @@ fn scraped(server: &Serving) -> Page {
 /// Begins a Solve, sends the head and a chunk of a megabyte, and keeps the stream open until it is dropped.
 async fn withholding(url: String, refused: mpsc::Sender<Status>) {
     let mut client = CalibrationServiceClient::connect(url).await.expect("a connection");
-    let whole = raw(2, 20_000);
-    let head = Message::Config(create(Source::TrackSet(convert::input::head_to_wire(&whole))));
-    let chunks = convert::input::chunks(whole).map(Message::TrackSetChunk);
+    let whole = convert::input::to_wire(raw(2, 20_000));
+    let head = Message::Config(create(Source::TrackSet(whole.head())));
+    let chunks = (0..).map_while(|number| whole.chunk(number)).map(Message::TrackSetChunk);
     let (sender, messages) = mpsc::channel(8);
     for message in std::iter::once(head).chain(chunks) {
         sender.send(solve_request(message)).await.expect("room");
@@ -165,13 +166,13 @@ async fn a_hundred_inputs_of_millions_stay_within_the_budget_and_two_hundred_meg
     let mut jobs = connected(&server).await;
     let running = created(&mut jobs, lasting(10_000)).await;
     reaches(&mut jobs, &running, &[JobState::Running]).await;
-    let whole = Arc::new(raw(4, 900_000));
+    let whole = Arc::new(convert::input::to_wire(raw(4, 900_000)));
     let streams = (0..100).map(|_| {
         let (url, whole) = (server.grpc.clone(), Arc::clone(&whole));
         tokio::spawn(async move {
             let mut client = CalibrationServiceClient::connect(url).await.expect("a connection");
-            let head = Message::Config(create(Source::TrackSet(convert::input::head_to_wire(&whole))));
-            let chunks = convert::input::chunks(whole).map(Message::TrackSetChunk);
+            let head = Message::Config(create(Source::TrackSet(whole.head())));
+            let chunks = (0..).map_while(move |number| whole.chunk(number)).map(Message::TrackSetChunk);
             let messages = tokio_stream::iter(std::iter::once(head).chain(chunks).map(solve_request));
             // A minute without a message ends the input: the last one never comes.
             client.solve(messages.chain(tokio_stream::pending())).await.map(drop).expect_err("never complete")

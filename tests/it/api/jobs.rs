@@ -206,7 +206,7 @@ async fn a_job_of_a_batch_that_takes_too_much_memory_is_named() {
     let engine = engine::Options { max_solver_bytes: scpsfm::solver::estimated_bytes(3, 4, 12), ..one_worker() };
     let server = TestServer::start_with(quick(), Options::default(), engine).await;
     let mut jobs = server.jobs().await;
-    let larger = || create(create_job_request::Source::TrackSet(convert::input::to_wire(&raw(3, 50))));
+    let larger = || create(create_job_request::Source::TrackSet(convert::input::to_wire(raw(3, 50))));
     let field = |status: &tonic::Status| {
         assert_eq!(status.code(), Code::InvalidArgument, "{status}");
         assert_eq!(status.get_details_error_info().expect("an ErrorInfo").reason, "JOB_TOO_LARGE");
@@ -253,7 +253,7 @@ async fn a_request_id_stands_for_one_job() {
     let first = created(&mut jobs, request.clone()).await;
     let again = created(&mut jobs, request.clone()).await;
     assert_eq!(first.name, again.name);
-    let other = create_job_request::Source::TrackSet(convert::input::to_wire(&raw(3, 5)));
+    let other = create_job_request::Source::TrackSet(convert::input::to_wire(raw(3, 5)));
     let other = proto::CreateJobRequest { request_id: "r-1".into(), ..create(other) };
     let status = jobs.create_job(other).await.expect_err("another body");
     assert_eq!(status.code(), Code::AlreadyExists);
@@ -310,7 +310,7 @@ async fn lists_are_filtered_ordered_and_paged() {
 async fn a_large_result_comes_in_chunks_from_any_offset() {
     let server = TestServer::start(quick()).await;
     let mut jobs = server.jobs().await;
-    let input = create_job_request::Source::TrackSet(convert::input::to_wire(&raw(2, 40_000)));
+    let input = create_job_request::Source::TrackSet(convert::input::to_wire(raw(2, 40_000)));
     let name = created(&mut jobs, create(input)).await.name;
     events(&mut jobs, &name, 0).await;
     let mut read = async |offset| {

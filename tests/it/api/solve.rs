@@ -7,6 +7,7 @@ use scpsfm::domain::job::Job;
 use scpsfm::engine::Engine;
 use scpsfm::rpc::convert;
 use scpsfm::rpc::convert::result::encode as encode_result;
+use scpsfm::rpc::convert::set::Set;
 use scpsfm::rpc::proto::calibration_service_client::CalibrationServiceClient;
 use scpsfm::rpc::proto::{self, JobState, create_job_request::Source, job_event::Body, solve_request::Message};
 use scpsfm::rpc::server::{Options, Server};
@@ -37,7 +38,7 @@ async fn events_name_the_job_first_and_end_with_its_state() {
     let (solver, hold) = held();
     let server = TestServer::start(solver).await;
     let whole = raw(3, 50);
-    let head = Message::Config(create(Source::TrackSet(convert::input::head_to_wire(&whole))));
+    let head = Message::Config(create(Source::TrackSet(convert::input::to_wire(whole.clone()).head())));
     let chunk = |range: std::ops::Range<usize>| {
         Message::TrackSetChunk(proto::TrackSetChunk {
             view_indices: whole.view[range.clone()].to_vec(),

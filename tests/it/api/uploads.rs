@@ -72,7 +72,7 @@ async fn an_upload_becomes_an_input_that_jobs_share() {
     let repeated = proto::CreateJobRequest { request_id: "r".into(), ..named(&input) };
     let second = created(&mut jobs, repeated.clone()).await;
     assert_eq!(created(&mut jobs, repeated).await, second);
-    let inline = create(Source::TrackSet(scpsfm::rpc::convert::input::to_wire(&raw(2, 60_000))));
+    let inline = create(Source::TrackSet(scpsfm::rpc::convert::input::to_wire(raw(2, 60_000))));
     let third = created(&mut jobs, inline.clone()).await;
     let mut other_body = inline;
     other_body.request_id = "r".into();

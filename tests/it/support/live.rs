@@ -28,7 +28,7 @@ pub async fn is_served(url: &str) {
 /// A request for that scene.
 pub fn scene_request(options: &SceneOptions) -> proto::CreateJobRequest {
     let scene = Scene::generate(options).expect("a scene");
-    create(Source::TrackSet(convert::input::to_wire(&scene.input)))
+    create(Source::TrackSet(convert::input::to_wire(scene.input.clone())))
 }
 
 /// A scene that is quickly solved.

@@ -11,7 +11,7 @@ pub const DEFAULT: &str = "tenants/default";
 
 /// The bytes of an input as they are uploaded.
 pub fn encoded(raw: &RawInput) -> Vec<u8> {
-    let data = proto::input_data::Data::TrackSet(convert::input::to_wire(raw));
+    let data = proto::input_data::Data::TrackSet(convert::input::to_wire(raw.clone()));
     proto::InputData { data: Some(data) }.encode_to_vec()
 }
 

@@ -22,7 +22,7 @@ pub fn raw(views: usize, tracks: usize) -> RawInput {
 
 /// A valid track set of three views and four tracks.
 pub fn track_set() -> proto::TrackSet {
-    convert::input::to_wire(&raw(3, 4))
+    convert::input::to_wire(raw(3, 4))
 }
 
 /// A valid matrix of two views and three tracks.
@@ -59,7 +59,7 @@ pub fn create(source: Source) -> proto::CreateJobRequest {
 }
 
 pub fn create_raw(raw: &RawInput) -> proto::CreateJobRequest {
-    create(Source::TrackSet(convert::input::to_wire(raw)))
+    create(Source::TrackSet(convert::input::to_wire(raw.clone())))
 }
 
 /// A valid request.

@@ -1,0 +1,183 @@
+//! The kinds of inputs, and the arrays of each: one table, by which sets are checked, measured and decoded, cut into
+//! chunks by clients and put together again by servers.
+
+use prost::Message;
+
+use crate::domain::{InvalidInput, Limits, Violation};
+use crate::rpc::proto;
+
+/// Entries of an array in one chunk that a client sends: at most 2.8 MB, well below any server's message limit.
+pub const CHUNK_ENTRIES: usize = 65_536;
+
+/// How often the bytes of a match are in memory while matches are joined: the match itself, its place in the order, and
+/// in the lists of neighbours and of pieces, some 52 bytes for the 8 of two keypoints.
+const JOINING_COPIES: u64 = 3;
+
+/// An array of a set.
+pub enum Array<'a> {
+    Integers(&'a mut Vec<u32>),
+    Reals(&'a mut Vec<f64>),
+    Bytes(&'a mut Vec<u8>),
+}
+
+/// How much of something there is, and how much there may be.
+pub struct Count {
+    pub name: &'static str,
+    pub count: usize,
+    pub max: usize,
+}
+
+impl Count {
+    fn of<T>(array: &'static str, entries: &[T], limits: &Limits) -> Self {
+        Self { name: array, count: entries.len(), max: max_entries(array, limits) }
+    }
+}
+
+/// An input in one message, or as a head and chunks.
+pub trait Set: Message + Default {
+    type Chunk;
+
+    /// Its name in requests and in violations.
+    const NAME: &'static str;
+
+    /// What precedes the chunks.
+    fn head(&self) -> Self;
+
+    /// What follows the head, part by part; `None` after the last one. Arrays of unequal lengths are sent as they are:
+    /// the server says what is wrong with them.
+    fn chunk(&self, number: usize) -> Option<Self::Chunk>;
+
+    /// Adds what follows.
+    fn append(&mut self, chunk: Self::Chunk);
+
+    /// The numbers that it claims, and its views.
+    fn claims(&self, limits: &Limits) -> Vec<Count>;
+
+    /// The lengths of its arrays.
+    fn lengths(&self, limits: &Limits) -> Vec<Count>;
+
+    /// Bytes that it takes in memory; those of matches count as often as joining needs them.
+    fn bytes(&self) -> u64;
+
+    /// The array with this tag, and its name.
+    fn array(&mut self, tag: u32) -> Option<(&'static str, Array<'_>)>;
+
+    /// Refuses what is above the limits by what is claimed and by what has arrived.
+    ///
+    /// # Errors
+    /// A violation of the first field that is too long.
+    fn check_counts(&self, limits: &Limits) -> Result<(), InvalidInput> {
+        within(Self::NAME, self.claims(limits))?;
+        within(Self::NAME, self.lengths(limits))
+    }
+}
+
+/// Implements [`Set`]. `head` is what is in no chunk, `claims` what is bounded of that, `whole` the array of it.
+macro_rules! sets {
+    ($($set:ident, $chunk:ident, $name:literal {
+        head: $($head:ident),+;
+        claims: $($claim:ident <= $bound:ident),*;
+        whole: $($whole_tag:literal $whole:ident $whole_kind:ident)?;
+        arrays: $($tag:literal $array:ident $kind:ident),+;
+    })+) => {$(
+        impl Set for proto::$set {
+            type Chunk = proto::$chunk;
+
+            const NAME: &'static str = $name;
+
+            fn head(&self) -> Self {
+                Self { $($head: self.$head.clone(),)+ ..Self::default() }
+            }
+
+            fn chunk(&self, number: usize) -> Option<proto::$chunk> {
+                let chunk = proto::$chunk { $($array: part(&self.$array, number)),+ };
+                (chunk.encoded_len() > 0).then_some(chunk)
+            }
+
+            fn append(&mut self, mut chunk: proto::$chunk) {
+                $(self.$array.append(&mut chunk.$array);)+
+            }
+
+            fn claims(&self, limits: &Limits) -> Vec<Count> {
+                vec![
+                    $(Count { name: stringify!($claim), count: self.$claim as usize, max: limits.$bound },)*
+                    Count { name: "views", count: self.views.len(), max: limits.max_views },
+                ]
+            }
+
+            fn lengths(&self, limits: &Limits) -> Vec<Count> {
+                vec![
+                    $(Count::of(stringify!($whole), &self.$whole, limits),)?
+                    $(Count::of(stringify!($array), &self.$array, limits),)+
+                ]
+            }
+
+            fn bytes(&self) -> u64 {
+                let whole = 0 $(+ bytes_of(stringify!($whole), &self.$whole))?;
+                whole + bytes_of("views", &self.views) $(+ bytes_of(stringify!($array), &self.$array))+
+            }
+
+            fn array(&mut self, tag: u32) -> Option<(&'static str, Array<'_>)> {
+                match tag {
+                    $($whole_tag => Some((stringify!($whole), Array::$whole_kind(&mut self.$whole))),)?
+                    $($tag => Some((stringify!($array), Array::$kind(&mut self.$array))),)+
+                    _ => None,
+                }
+            }
+        }
+    )+};
+}
+
+sets! {
+    TrackSet, TrackSetChunk, "track_set" {
+        head: track_count, views;
+        claims: track_count <= max_tracks;
+        whole: ;
+        arrays: 3 view_indices Integers, 4 track_indices Integers, 5 xs Reals, 6 ys Reals, 7 sigmas_px Reals,
+            8 depths Reals;
+    }
+    MeasurementMatrix, MeasurementMatrixChunk, "measurement_matrix" {
+        head: view_count, track_count, has_depths, views;
+        claims: view_count <= max_views, track_count <= max_tracks;
+        whole: ;
+        arrays: 3 values Reals, 5 visibility Bytes;
+    }
+    MatchSet, MatchSetChunk, "match_set" {
+        head: keypoint_counts, views;
+        claims: ;
+        whole: 2 keypoint_counts Integers;
+        arrays: 3 xs Reals, 4 ys Reals, 5 first_view_indices Integers, 6 second_view_indices Integers,
+            7 match_counts Integers, 8 first_keypoint_indices Integers, 9 second_keypoint_indices Integers;
+    }
+}
+
+/// Entries that an array may have at most.
+pub fn max_entries(array: &str, limits: &Limits) -> usize {
+    match array {
+        "keypoint_counts" => limits.max_views,
+        "values" => limits.max_observations.saturating_mul(3),
+        _ => limits.max_observations,
+    }
+}
+
+fn bytes_of<T>(array: &str, entries: &Vec<T>) -> u64 {
+    let copies = match array {
+        "first_keypoint_indices" | "second_keypoint_indices" => JOINING_COPIES,
+        _ => 1,
+    };
+    copies * (entries.capacity() * size_of::<T>()) as u64
+}
+
+fn part<T: Clone>(entries: &[T], number: usize) -> Vec<T> {
+    entries.iter().skip(number * CHUNK_ENTRIES).take(CHUNK_ENTRIES).cloned().collect()
+}
+
+/// Refuses the first count that is above its limit.
+pub fn within(prefix: &str, counts: Vec<Count>) -> Result<(), InvalidInput> {
+    match counts.into_iter().find(|Count { count, max, .. }| count > max) {
+        Some(Count { name, count, max }) => {
+            Err(Violation::of(format!("{prefix}.{name}"), format!("{count} are above the limit of {max}")).into())
+        }
+        None => Ok(()),
+    }
+}
