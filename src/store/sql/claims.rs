@@ -6,7 +6,7 @@
 //! A suspect, which lost attempts before, is begun only by a process in which nothing else runs. Other claims lease it
 //! as a prefetched job, so that it stays with one process until that is idle, and extend this lease.
 
-use std::time::SystemTime;
+use std::time::{Duration, SystemTime};
 
 use super::rows::{self, LockedJob, insert_event, integer, micros, returning_job, select_locked_job};
 use super::{Connection, Lock, Row, Statement, fairness};
@@ -31,192 +31,175 @@ pub(super) async fn claim(
     now: SystemTime,
     lease_now: SystemTime,
 ) -> Result<Claims, Error> {
-    if claim.shares.max_running.is_some() {
-        // Two that count at once would pass the bound together.
-        connection.take_lock(Lock::Claims).await?;
+    Claiming { connection, claim, now, lease_now }.run().await
+}
+
+/// A claim under way.
+struct Claiming<'a> {
+    connection: &'a mut dyn Connection,
+    claim: &'a Claim,
+    now: SystemTime,
+    lease_now: SystemTime,
+}
+
+impl Claiming<'_> {
+    async fn run(mut self) -> Result<Claims, Error> {
+        if self.claim.shares.max_running.is_some() {
+            // Two that count at once would pass the bound together.
+            self.connection.take_lock(Lock::Claims).await?;
+        }
+        let job = match &self.claim.begin {
+            Some((lease, created)) => self.prefetched(lease, *created).await?,
+            None => match self.next(|_| true).await? {
+                Some(job) => Some(job),
+                None => self.prefetched_by_any().await?,
+            },
+        };
+        let Some(job) = job else {
+            return Ok(Claims { begun: self.begun_before().await?, ..Claims::default() });
+        };
+        if is_suspect(self.claim, &job) {
+            let suspect = self.lease(&job, self.claim.lease_for).await?;
+            return Ok(Claims { suspect: Some(suspect), ..Claims::default() });
+        }
+        let begun = self.begin(&job).await?;
+        let prefetched = match self.claim.prefetch {
+            Some(terms) => self.prefetch(terms).await?,
+            None => None,
+        };
+        Ok(Claims { begun: Some(begun), prefetched, suspect: None })
     }
-    let job = match &claim.begin {
-        Some((lease, created)) => prefetched(connection, claim, lease, *created, now, lease_now).await?,
-        None => match next(connection, claim, |_| true, now, lease_now).await? {
-            Some(job) => Some(job),
-            None => prefetched_by_any(connection, claim, now, lease_now).await?,
-        },
-    };
-    let Some(job) = job else {
-        return Ok(Claims { begun: begun_before(connection, claim, lease_now).await?, ..Claims::default() });
-    };
-    if is_suspect(claim, &job) {
-        let suspect = lease(connection, claim, &job, lease_now + claim.lease_for).await?;
-        return Ok(Claims { suspect: Some(suspect), ..Claims::default() });
+
+    /// The job whose turn it is among those that nobody has a lease on, counted for its tenant; none where it is not
+    /// `wanted`.
+    async fn next(&mut self, wanted: impl Fn(&LockedJob) -> bool) -> Result<Option<LockedJob>, Error> {
+        for tenant in fairness::turns(self.connection, self.claim, self.lease_now).await? {
+            let first = Statement::new(select_locked_job!(
+                "WHERE state = 'QUEUED' AND tenant = $1 AND (deadline IS NULL OR deadline > $2) \
+                 AND (lease_expires IS NULL OR lease_expires <= $3) ORDER BY priority DESC, create_time, id LIMIT 1"
+            ))
+            .bind(&tenant)
+            .bind(micros(self.now))
+            .bind(micros(self.lease_now))
+            .then(self.connection.skip_locked());
+            if let Some(row) = self.connection.optional_row(first).await? {
+                let job = LockedJob::from_row(&row)?;
+                if !wanted(&job) {
+                    break;
+                }
+                fairness::count(self.connection, &self.claim.shares, &tenant).await?;
+                return Ok(Some(job));
+            }
+        }
+        Ok(None)
     }
-    let begun = begin(connection, claim, &job, now, lease_now).await?;
-    let prefetched = match claim.prefetch {
-        Some(terms) => prefetch(connection, claim, terms, now, lease_now).await?,
-        None => None,
-    };
-    Ok(Claims { begun: Some(begun), prefetched, suspect: None })
+
+    /// The job that an earlier claim of this worker prefetched, if nobody else has leased it since.
+    async fn prefetched(&mut self, lease: &Lease, created: SystemTime) -> Result<Option<LockedJob>, Error> {
+        // One whose lease has expired is not among those that are counted for the bound.
+        let expires_after = self.claim.shares.max_running.map_or(i64::MIN, |_| micros(self.lease_now));
+        let same = Statement::new(select_locked_job!(
+            "WHERE tenant = $1 AND job = $2 AND attempt = $3 AND create_time = $4 AND state = 'QUEUED' \
+             AND (deadline IS NULL OR deadline > $5) AND lease_worker = $6 AND lease_expires > $7 \
+             AND (SELECT pause_time FROM queue) IS NULL"
+        ))
+        .bind(&lease.name.tenant)
+        .bind(&lease.name.job)
+        .bind(lease.attempt.saturating_sub(1))
+        .bind(micros(created))
+        .bind(micros(self.now))
+        .bind(&self.claim.worker)
+        .bind(expires_after)
+        .then(self.connection.for_update());
+        self.one_locked(same).await
+    }
+
+    /// The job that an earlier claim of this process has begun, where the answer was lost: its lease is extended. Of a
+    /// process in which nothing else runs; in another one a worker has it.
+    async fn begun_before(&mut self) -> Result<Option<Claimed>, Error> {
+        let (Some((lease, created)), None) = (&self.claim.begin, self.claim.suspect_after) else { return Ok(None) };
+        let extend = Statement::new(returning_job!(
+            "UPDATE jobs SET lease_expires = $1 WHERE tenant = $2 AND job = $3 AND attempt = $4 AND create_time = $5 \
+             AND state = 'RUNNING' AND lease_worker = $6"
+        ))
+        .bind(micros(self.lease_now + self.claim.lease_for))
+        .bind(&lease.name.tenant)
+        .bind(&lease.name.job)
+        .bind(lease.attempt)
+        .bind(micros(*created))
+        .bind(&self.claim.worker);
+        self.connection.optional_row(extend).await?.map(|row| claimed(&row, 0)).transpose()
+    }
+
+    /// A job that any worker has prefetched: it would wait for that worker, and this one is idle. There are as many as
+    /// workers at most, and their tenants' turns have come. A suspect stays with the process that waits to be idle.
+    async fn prefetched_by_any(&mut self) -> Result<Option<LockedJob>, Error> {
+        let first = Statement::new(select_locked_job!(
+            "WHERE state = 'QUEUED' AND lease_expires IS NOT NULL AND lease_expires > $1 \
+             AND (deadline IS NULL OR deadline > $2) AND lost_attempts < $3 \
+             AND (SELECT pause_time FROM queue) IS NULL \
+             ORDER BY priority DESC, create_time, id LIMIT 1"
+        ))
+        .bind(micros(self.lease_now))
+        .bind(micros(self.now))
+        .bind(self.claim.suspect_after.map_or(i64::MAX, i64::from))
+        .then(self.connection.skip_locked());
+        self.one_locked(first).await
+    }
+
+    async fn one_locked(&mut self, select: Statement) -> Result<Option<LockedJob>, Error> {
+        self.connection.optional_row(select).await?.as_ref().map(LockedJob::from_row).transpose()
+    }
+
+    /// Begins an attempt at a queued job.
+    async fn begin(&mut self, job: &LockedJob) -> Result<Claimed, Error> {
+        let (attempt, sequence) = (job.attempt + 1, job.last_sequence + 1);
+        let lease = Statement::new(returning_job!(
+            "UPDATE jobs SET state = 'RUNNING', attempt = $1, start_time = COALESCE(start_time, $2), lease_worker = $3, \
+             lease_expires = $4, progress = NULL, last_sequence = $5 WHERE id = $6"
+        ))
+        .bind(attempt)
+        .bind(micros(self.now))
+        .bind(&self.claim.worker)
+        .bind(micros(self.lease_now + self.claim.lease_for))
+        .bind(integer(sequence))
+        .bind(job.id);
+        let begin =
+            Statement::new("INSERT INTO attempts (job_id, attempt, server, start_time) VALUES ($1, $2, $3, $4)")
+                .bind(job.id)
+                .bind(attempt)
+                .bind(&self.claim.worker)
+                .bind(micros(self.now));
+        let event = EventBody::State { state: JobState::Running, failure: None };
+        let event = insert_event(job.id, sequence, attempt, &event, self.now)?;
+        let rows = self.connection.batch(vec![lease, begin, event]).await?;
+        self.connection.notify(Notification::Events(job.name.clone())).await?;
+        let changed = rows.first().ok_or_else(|| Error::Corrupt("a job that was just leased is not there".into()))?;
+        claimed(changed, 0)
+    }
+
+    /// Leases the next job without a word to anyone: it is not begun.
+    async fn prefetch(&mut self, terms: Prefetch) -> Result<Option<Claimed>, Error> {
+        let claim = self.claim;
+        let wanted = |job: &LockedJob| job.observation_count <= terms.max_observations && !is_suspect(claim, job);
+        let Some(job) = self.next(wanted).await? else { return Ok(None) };
+        self.lease(&job, terms.lease_for).await.map(Some)
+    }
+
+    /// Leases a queued job that is not begun.
+    async fn lease(&mut self, job: &LockedJob, lease_for: Duration) -> Result<Claimed, Error> {
+        let lease =
+            Statement::new(returning_job!("UPDATE jobs SET lease_worker = $1, lease_expires = $2 WHERE id = $3"))
+                .bind(&self.claim.worker)
+                .bind(micros(self.lease_now + lease_for))
+                .bind(job.id);
+        claimed(&self.connection.row(lease).await?, 1)
+    }
 }
 
 /// Whether a job is to be begun once nothing else runs in the process.
 fn is_suspect(claim: &Claim, job: &LockedJob) -> bool {
     claim.suspect_after.is_some_and(|lost| job.lost_attempts >= lost)
-}
-
-/// The job whose turn it is among those that nobody has a lease on, counted for its tenant; none where it is not
-/// `wanted`.
-async fn next(
-    connection: &mut dyn Connection,
-    claim: &Claim,
-    wanted: impl Fn(&LockedJob) -> bool,
-    now: SystemTime,
-    lease_now: SystemTime,
-) -> Result<Option<LockedJob>, Error> {
-    for tenant in fairness::turns(connection, claim, lease_now).await? {
-        let first = Statement::new(select_locked_job!(
-            "WHERE state = 'QUEUED' AND tenant = $1 AND (deadline IS NULL OR deadline > $2) \
-             AND (lease_expires IS NULL OR lease_expires <= $3) ORDER BY priority DESC, create_time, id LIMIT 1"
-        ))
-        .bind(&tenant)
-        .bind(micros(now))
-        .bind(micros(lease_now))
-        .then(connection.skip_locked());
-        if let Some(row) = connection.optional_row(first).await? {
-            let job = LockedJob::from_row(&row)?;
-            if !wanted(&job) {
-                break;
-            }
-            fairness::count(connection, &claim.shares, &tenant).await?;
-            return Ok(Some(job));
-        }
-    }
-    Ok(None)
-}
-
-/// The job that an earlier claim of this worker prefetched, if nobody else has leased it since.
-async fn prefetched(
-    connection: &mut dyn Connection,
-    claim: &Claim,
-    lease: &Lease,
-    created: SystemTime,
-    now: SystemTime,
-    lease_now: SystemTime,
-) -> Result<Option<LockedJob>, Error> {
-    // One whose lease has expired is not among those that are counted for the bound.
-    let expires_after = claim.shares.max_running.map_or(i64::MIN, |_| micros(lease_now));
-    let same = Statement::new(select_locked_job!(
-        "WHERE tenant = $1 AND job = $2 AND attempt = $3 AND create_time = $4 AND state = 'QUEUED' \
-         AND (deadline IS NULL OR deadline > $5) AND lease_worker = $6 AND lease_expires > $7 \
-         AND (SELECT pause_time FROM queue) IS NULL"
-    ))
-    .bind(&lease.name.tenant)
-    .bind(&lease.name.job)
-    .bind(lease.attempt.saturating_sub(1))
-    .bind(micros(created))
-    .bind(micros(now))
-    .bind(&claim.worker)
-    .bind(expires_after)
-    .then(connection.for_update());
-    connection.optional_row(same).await?.as_ref().map(LockedJob::from_row).transpose()
-}
-
-/// The job that an earlier claim of this process has begun, where the answer was lost: its lease is extended. Of a
-/// process in which nothing else runs; in another one a worker has it.
-async fn begun_before(
-    connection: &mut dyn Connection,
-    claim: &Claim,
-    lease_now: SystemTime,
-) -> Result<Option<Claimed>, Error> {
-    let (Some((lease, created)), None) = (&claim.begin, claim.suspect_after) else { return Ok(None) };
-    let extend = Statement::new(returning_job!(
-        "UPDATE jobs SET lease_expires = $1 WHERE tenant = $2 AND job = $3 AND attempt = $4 AND create_time = $5 \
-         AND state = 'RUNNING' AND lease_worker = $6"
-    ))
-    .bind(micros(lease_now + claim.lease_for))
-    .bind(&lease.name.tenant)
-    .bind(&lease.name.job)
-    .bind(lease.attempt)
-    .bind(micros(*created))
-    .bind(&claim.worker);
-    connection.optional_row(extend).await?.map(|row| claimed(&row, 0)).transpose()
-}
-
-/// A job that any worker has prefetched: it would wait for that worker, and this one is idle. There are as many as
-/// workers at most, and their tenants' turns have come. A suspect stays with the process that waits to be idle.
-async fn prefetched_by_any(
-    connection: &mut dyn Connection,
-    claim: &Claim,
-    now: SystemTime,
-    lease_now: SystemTime,
-) -> Result<Option<LockedJob>, Error> {
-    let first = Statement::new(select_locked_job!(
-        "WHERE state = 'QUEUED' AND lease_expires IS NOT NULL AND lease_expires > $1 \
-         AND (deadline IS NULL OR deadline > $2) AND lost_attempts < $3 AND (SELECT pause_time FROM queue) IS NULL \
-         ORDER BY priority DESC, create_time, id LIMIT 1"
-    ))
-    .bind(micros(lease_now))
-    .bind(micros(now))
-    .bind(claim.suspect_after.map_or(i64::MAX, i64::from))
-    .then(connection.skip_locked());
-    connection.optional_row(first).await?.as_ref().map(LockedJob::from_row).transpose()
-}
-
-/// Begins an attempt at a queued job.
-async fn begin(
-    connection: &mut dyn Connection,
-    claim: &Claim,
-    job: &LockedJob,
-    now: SystemTime,
-    lease_now: SystemTime,
-) -> Result<Claimed, Error> {
-    let (attempt, sequence) = (job.attempt + 1, job.last_sequence + 1);
-    let lease = Statement::new(returning_job!(
-        "UPDATE jobs SET state = 'RUNNING', attempt = $1, start_time = COALESCE(start_time, $2), lease_worker = $3, \
-         lease_expires = $4, progress = NULL, last_sequence = $5 WHERE id = $6"
-    ))
-    .bind(attempt)
-    .bind(micros(now))
-    .bind(&claim.worker)
-    .bind(micros(lease_now + claim.lease_for))
-    .bind(integer(sequence))
-    .bind(job.id);
-    let begin = Statement::new("INSERT INTO attempts (job_id, attempt, server, start_time) VALUES ($1, $2, $3, $4)")
-        .bind(job.id)
-        .bind(attempt)
-        .bind(&claim.worker)
-        .bind(micros(now));
-    let event = EventBody::State { state: JobState::Running, failure: None };
-    let event = insert_event(job.id, sequence, attempt, &event, now)?;
-    let rows = connection.batch(vec![lease, begin, event]).await?;
-    connection.notify(Notification::Events(job.name.clone())).await?;
-    let changed = rows.first().ok_or_else(|| Error::Corrupt("a job that was just leased is not there".into()))?;
-    claimed(changed, 0)
-}
-
-/// Leases the next job without a word to anyone: it is not begun.
-async fn prefetch(
-    connection: &mut dyn Connection,
-    claim: &Claim,
-    terms: Prefetch,
-    now: SystemTime,
-    lease_now: SystemTime,
-) -> Result<Option<Claimed>, Error> {
-    let wanted = |job: &LockedJob| job.observation_count <= terms.max_observations && !is_suspect(claim, job);
-    let Some(job) = next(connection, claim, wanted, now, lease_now).await? else { return Ok(None) };
-    lease(connection, claim, &job, lease_now + terms.lease_for).await.map(Some)
-}
-
-/// Leases a queued job that is not begun.
-async fn lease(
-    connection: &mut dyn Connection,
-    claim: &Claim,
-    job: &LockedJob,
-    expires: SystemTime,
-) -> Result<Claimed, Error> {
-    let lease = Statement::new(returning_job!("UPDATE jobs SET lease_worker = $1, lease_expires = $2 WHERE id = $3"))
-        .bind(&claim.worker)
-        .bind(micros(expires))
-        .bind(job.id);
-    claimed(&connection.row(lease).await?, 1)
 }
 
 /// A job with its lease, from a row of all its columns. `earlier`: attempts that are to be begun before the lease's.

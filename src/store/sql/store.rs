@@ -110,8 +110,9 @@ macro_rules! writes {
 /// `now` is the caller's clock, so that tests need not wait; times are kept to the microsecond.
 impl dyn Database {
     /// Stores queued jobs with their inputs and their first events, all or none, unless the request id of one is known
-    /// or admission refuses; the answers are in their order. A request id that comes twice with the same body is one job: with [`NewRecord::cancel_on_disconnect`] the call attaches to it, as far as it depends on
-    /// its calls ([`Job::attached_calls`]), and without it does not depend on any from then on.
+    /// or admission refuses; the answers are in their order. A request id that comes twice with the same body is one
+    /// job: with [`NewRecord::cancel_on_disconnect`] the call attaches to it, as far as it depends on its calls
+    /// ([`Job::attached_calls`]), and without it does not depend on any from then on.
     ///
     /// # Errors
     /// [`Error::AlreadyExists`], [`Error::QueueFull`], [`Error::BatchTooLarge`], of the first job that is refused.
@@ -161,8 +162,9 @@ impl dyn Database {
         reads!(self, "events_after", Small, |connection| jobs::events_after(connection, name, after, limit))
     }
 
-    /// Leases the next job in the queue and begins it; nothing where none waits, or the queue is paused. Tenants
-    /// take turns, by their weights; within a tenant jobs go by priority, then age. Jobs past their deadline are left to [`Self::sweep`].
+    /// Leases the next job in the queue and begins it; nothing where none waits, or the queue is paused. Tenants take
+    /// turns, by their weights; within a tenant jobs go by priority, then age. Jobs past their deadline are left to
+    /// [`Self::sweep`].
     ///
     /// The claim may also prefetch: it leases the job after it, which stays queued until a later claim begins it. Other
     /// claims pass over a prefetched job until that lease expires, but for those that find no other job. Nothing need
