@@ -5,6 +5,7 @@ use std::str::FromStr;
 
 use serde::{Deserialize, Deserializer, Serialize, Serializer};
 use sqlx::postgres::PgConnectOptions;
+use url::{Position, Url};
 
 /// What stands in for the password wherever the address is shown.
 const HIDDEN: &str = "***";
@@ -33,7 +34,7 @@ const PARAMETERS: [&str; 12] = [
 pub struct DatabaseUrl {
     options: PgConnectOptions,
     /// Without the password.
-    shown: String,
+    shown: Url,
     /// As it was given, to tell two apart.
     given: String,
 }
@@ -51,7 +52,7 @@ impl DatabaseUrl {
 
     /// Whether it has a password, which is not shown.
     pub fn has_password(&self) -> bool {
-        self.shown != self.given
+        self.shown.password().is_some()
     }
 
     /// As it was given, password included: for whoever hands it on.
@@ -64,44 +65,35 @@ impl FromStr for DatabaseUrl {
     type Err = UrlError;
 
     fn from_str(given: &str) -> Result<Self, UrlError> {
-        let (scheme, rest) = given.split_once("://").ok_or(UrlError("it has no scheme"))?;
-        if !matches!(scheme, "postgres" | "postgresql") {
+        let mut url = Url::parse(given).map_err(|_| UrlError("it cannot be parsed"))?;
+        if !matches!(url.scheme(), "postgres" | "postgresql") {
             return Err(UrlError("its scheme is not postgres"));
         }
-        let (authority, path) = rest.split_at(rest.find(['/', '?', '#']).unwrap_or(rest.len()));
-        if path.contains(['@', '#']) {
+        if url[Position::BeforePath..].contains(['@', '#']) {
             return Err(UrlError(
                 "there is a `/`, `?` or `#` before the `@`, or a `#`: write them as %2F, %3F and %23",
             ));
         }
-        for (name, _) in
-            path.split_once('?').map_or("", |(_, query)| query).split('&').filter_map(|p| p.split_once('='))
-        {
-            if !PARAMETERS.contains(&name) && !name.starts_with("options[") {
-                return Err(UrlError("it has a parameter that is not known, or a password that is not before the `@`"));
-            }
+        if url.query_pairs().any(|(name, _)| !PARAMETERS.contains(&&*name) && !name.starts_with("options[")) {
+            return Err(UrlError("it has a parameter that is not known, or a password that is not before the `@`"));
+        }
+        if url.password() == Some(HIDDEN) {
+            return Err(UrlError(
+                "its password is ***, which stands for one that is not shown: put the password in its place, or \
+                 the whole address into SCPSFM_STORE__URL",
+            ));
         }
         let options = given.parse().map_err(|_| UrlError("it cannot be parsed"))?;
-        let authority = match authority.rsplit_once('@') {
-            Some((user, host)) => match user.split_once(':') {
-                Some((_, HIDDEN)) => {
-                    return Err(UrlError(
-                        "its password is ***, which stands for one that is not shown: put the password in its place, or \
-                         the whole address into SCPSFM_STORE__URL",
-                    ));
-                }
-                Some((user, _)) => format!("{user}:{HIDDEN}@{host}"),
-                None => format!("{user}@{host}"),
-            },
-            None => authority.to_owned(),
-        };
-        Ok(Self { options, shown: format!("{scheme}://{authority}{path}"), given: given.to_owned() })
+        if url.password().is_some() {
+            url.set_password(Some(HIDDEN)).map_err(|()| UrlError("it has a password and no host"))?;
+        }
+        Ok(Self { options, shown: url, given: given.to_owned() })
     }
 }
 
 impl fmt::Display for DatabaseUrl {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        f.write_str(&self.shown)
+        f.write_str(self.shown.as_str())
     }
 }
 
@@ -120,7 +112,7 @@ impl PartialEq for DatabaseUrl {
 impl Serialize for DatabaseUrl {
     /// Without the password.
     fn serialize<S: Serializer>(&self, serializer: S) -> Result<S::Ok, S::Error> {
-        serializer.serialize_str(&self.shown)
+        serializer.serialize_str(self.shown.as_str())
     }
 }
 
