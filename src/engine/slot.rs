@@ -5,8 +5,8 @@ use std::sync::Arc;
 use std::time::{Duration, SystemTime};
 
 use tokio::sync::watch as channel;
-use tokio::task::JoinHandle;
 use tokio::time::{Instant, sleep, sleep_until, timeout};
+use tokio_util::task::AbortOnDropHandle;
 
 use super::execution::{Finished, HEARTBEATS_A_LEASE, JobExecution, Loaded, RETRY_PAUSE, in_time};
 use super::limits::suspect_after;
@@ -40,13 +40,14 @@ const MAX_PREFETCH_OBSERVATIONS: u32 = 100_000;
 pub(super) async fn run(inner: Arc<Inner>, worker: Worker) {
     let mut work = inner.work.subscribe();
     let mut phase = inner.phase.subscribe();
-    let mut committing: Option<Task<()>> = None;
+    // Given up with the slot, as what is prefetched.
+    let mut committing: Option<AbortOnDropHandle<()>> = None;
     let mut prefetched: Option<Prefetched> = None;
     while *phase.borrow_and_update() == Phase::Open {
         // Before the look, so that a job that is stored during it is not missed.
         work.mark_unchanged();
         let (loaded, next) = match prefetched.take() {
-            Some(mut loading) => match begin(&mut loading).await {
+            Some(loading) => match begin(loading).await {
                 Some((loaded, next)) => (Ok(loaded), next),
                 None => continue,
             },
@@ -69,11 +70,12 @@ pub(super) async fn run(inner: Arc<Inner>, worker: Worker) {
             Ok(loaded) => solve(loaded, inner.options.short_job, &mut prefetched).await,
             Err(finished) => finished,
         };
-        if let Some(mut before) = committing.replace(Task(tokio::spawn(finished.finalise()))) {
+        if let Some(mut before) = committing.replace(AbortOnDropHandle::new(tokio::spawn(finished.finalise()))) {
             // Results that the store cannot take must not pile up, nor are jobs begun that it may not lease.
-            if timeout(inner.options.short_job, before.output()).await.is_err() {
+            // It breaks off by a panic alone, which has been reported; its lease runs out.
+            if timeout(inner.options.short_job, &mut before).await.is_err() {
                 prefetched = None;
-                before.output().await;
+                let _ = before.await;
             }
         }
         if worker.is_gone() {
@@ -83,8 +85,8 @@ pub(super) async fn run(inner: Arc<Inner>, worker: Worker) {
     }
     // Nobody is going to begin it.
     drop(prefetched);
-    if let Some(mut last) = committing {
-        last.output().await;
+    if let Some(last) = committing {
+        let _ = last.await;
     }
 }
 
@@ -147,19 +149,19 @@ async fn begin_suspect(
 }
 
 /// A job on its way into the worker's hands. Dropped, it is not begun, and its lease lapses.
-type Prefetched = Task<Option<Loaded>>;
+type Prefetched = AbortOnDropHandle<Option<Loaded>>;
 
 /// Loads a prefetched job, unless a suspect waits for those that run.
 fn prefetch(inner: &Arc<Inner>, worker: &Worker, claimed: Claimed) -> Option<Prefetched> {
     let execution = JobExecution::new(inner.clone(), claimed, inner.prefetch_lease(), inner.limits.try_acquire()?);
     let worker = worker.clone();
     // One that cannot be read is told of when it is claimed.
-    Some(Task(tokio::spawn(async move { execution.load(&worker).await.ok() })))
+    Some(AbortOnDropHandle::new(tokio::spawn(async move { execution.load(&worker).await.ok() })))
 }
 
 /// Begins with a prefetched job; `None` where it is not to be had any more.
-async fn begin(loading: &mut Prefetched) -> Option<(Loaded, Option<Claimed>)> {
-    loading.output().await??.begin().await
+async fn begin(loading: Prefetched) -> Option<(Loaded, Option<Claimed>)> {
+    loading.await.ok()??.begin().await
 }
 
 /// Has a job solved. Where it is no short one, what is prefetched behind it is left to others.
@@ -170,22 +172,6 @@ async fn solve(loaded: Loaded, short_job: Duration, prefetched: &mut Option<Pref
     }
     *prefetched = None;
     solving.await
-}
-
-/// A task that is given up with the slot that waits for it.
-struct Task<T>(JoinHandle<T>);
-
-impl<T> Task<T> {
-    /// `None` where it broke off by a panic, which has been reported; a lease that it had runs out.
-    async fn output(&mut self) -> Option<T> {
-        (&mut self.0).await.ok()
-    }
-}
-
-impl<T> Drop for Task<T> {
-    fn drop(&mut self) {
-        self.0.abort();
-    }
 }
 
 /// Ends what waited too long, takes back what was left lying, and counts the queue whenever it changed.

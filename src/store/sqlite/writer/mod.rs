@@ -85,7 +85,7 @@ impl Writer {
         loop {
             match timeout(self.turn_timeout, &mut answer).await {
                 Ok(answered) => return answered.unwrap_or_else(|_| Err(closed())),
-                Err(_) if turn.give_up() => {
+                Err(_) if turn.take() => {
                     return Err(no_turn(self.turn_timeout));
                 }
                 // What has begun ends, sooner or later, and whether it came to anything is known only then.

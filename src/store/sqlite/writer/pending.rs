@@ -2,7 +2,7 @@
 
 use std::panic::AssertUnwindSafe;
 use std::sync::Arc;
-use std::sync::atomic::{AtomicU8, Ordering};
+use std::sync::atomic::{AtomicBool, Ordering};
 
 use futures_util::FutureExt;
 use tokio::sync::oneshot;
@@ -11,27 +11,14 @@ use super::{LARGE_BYTES, WriteConnection};
 use crate::store::Error;
 use crate::store::sql::{Operation, WriteIntent};
 
-/// Whether an operation has begun, or its caller has given it up: whichever comes first.
+/// What the writer takes to begin an operation, or its caller to give it up: whichever comes first.
 #[derive(Debug, Default)]
-pub(super) struct Turn(AtomicU8);
+pub(super) struct Turn(AtomicBool);
 
 impl Turn {
-    const WAITING: u8 = 0;
-    const BEGUN: u8 = 1;
-    const GIVEN_UP: u8 = 2;
-
-    /// `false` where its caller has given it up.
-    fn begin(&self) -> bool {
-        self.leave_waiting(Self::BEGUN)
-    }
-
-    /// `false` where it has begun.
-    pub(super) fn give_up(&self) -> bool {
-        self.leave_waiting(Self::GIVEN_UP)
-    }
-
-    fn leave_waiting(&self, to: u8) -> bool {
-        self.0.compare_exchange(Self::WAITING, to, Ordering::AcqRel, Ordering::Acquire).is_ok()
+    /// `false` where the other one has it.
+    pub(super) fn take(&self) -> bool {
+        !self.0.swap(true, Ordering::AcqRel)
     }
 }
 
@@ -56,7 +43,7 @@ impl Pending {
 
     /// Marks it as begun; `false` where its caller is gone, and nobody wants it any more.
     pub(super) fn begins(&self) -> bool {
-        self.turn.begin() && !self.reply.is_closed()
+        self.turn.take() && !self.reply.is_closed()
     }
 
     /// Whether it is to have a commit of its own.
@@ -87,21 +74,17 @@ mod tests {
 
     #[test]
     fn of_a_writer_and_a_caller_one_has_the_turn() {
-        let turn = || Arc::new(Turn::default());
-        let (begun, given_up) = (turn(), turn());
-        assert!(begun.begin() && !begun.give_up());
-        assert!(given_up.give_up() && !given_up.begin());
         for round in 0..1_000 {
-            let (turn, both) = (turn(), Arc::new(std::sync::Barrier::new(2)));
+            let (turn, both) = (Arc::new(Turn::default()), Arc::new(std::sync::Barrier::new(2)));
             let begins = thread::spawn({
                 let (turn, both) = (turn.clone(), both.clone());
                 move || {
                     both.wait();
-                    turn.begin()
+                    turn.take()
                 }
             });
             both.wait();
-            let given_up = turn.give_up();
+            let given_up = turn.take();
             assert_ne!(begins.join().expect("no panic"), given_up, "round {round}");
         }
     }
