@@ -24,24 +24,12 @@ impl Engine {
         Ok(self.inner.dated(self.inner.store.set_priority(name, etag, priority).await?))
     }
 
-    /// Pauses the queue: no server of the store begins a job until [`Engine::resume`], also after a restart. What runs
-    /// goes on.
+    /// Pauses the queue, so that no server of the store begins a job, also after a restart, or ends the pause. What
+    /// runs goes on.
     ///
     /// # Errors
     /// [`StoreError::Unavailable`].
-    pub async fn pause(&self) -> Result<(), Error> {
-        self.set_paused(true).await
-    }
-
-    /// Ends a pause of the queue.
-    ///
-    /// # Errors
-    /// [`StoreError::Unavailable`].
-    pub async fn resume(&self) -> Result<(), Error> {
-        self.set_paused(false).await
-    }
-
-    async fn set_paused(&self, paused: bool) -> Result<(), Error> {
+    pub async fn set_paused(&self, paused: bool) -> Result<(), Error> {
         self.inner.store.set_paused(paused, self.inner.now()).await?;
         self.inner.work_waits();
         // The count of the queue tells of the change.

@@ -71,7 +71,7 @@ const SMALL_JOB: [u32; 3] = [10, 1_000, 10_000];
 
 /// A handle on a running engine; clones are the same engine.
 ///
-/// Jobs are stored before [`Engine::submit`] returns, and go on after a restart. End it with [`Engine::drain`]; one
+/// Jobs are stored before [`Engine::submit_batch`] returns, and go on after a restart. End it with [`Engine::drain`]; one
 /// that is merely dropped with its runtime leaves its running jobs to the next start, as a crash would.
 #[derive(Clone)]
 pub struct Engine {
@@ -178,20 +178,13 @@ impl Engine {
         Ok(Self { inner })
     }
 
-    /// Admits and stores a job. A repeated request id with the same body gives the job that the first call made.
+    /// Admits and stores jobs, all or none; the answers are in their order. A repeated request id with the same body
+    /// gives the job that the first call made.
     ///
     /// # Errors
-    /// [`StoreError::QueueFull`] at once when too much waits, [`StoreError::BatchTooLarge`], [`Error::JobTooLarge`],
-    /// [`StoreError::AlreadyExists`] for a taken job id or a request id with another body, [`Error::InvalidArgument`],
-    /// [`Error::Draining`].
-    pub async fn submit(&self, new: NewJob) -> Result<Job, Error> {
-        self.inner.clone().submit(new).await
-    }
-
-    /// The same for several jobs, all or none; the answers are in their order.
-    ///
-    /// # Errors
-    /// As [`Engine::submit`], of the first job that is refused.
+    /// Of the first job that is refused: [`StoreError::QueueFull`] at once when too much waits,
+    /// [`StoreError::BatchTooLarge`], [`Error::JobTooLarge`], [`StoreError::AlreadyExists`] for a taken job id or a
+    /// request id with another body, [`Error::InvalidArgument`], [`Error::Draining`].
     pub async fn submit_batch(&self, news: Vec<NewJob>) -> Result<Vec<Job>, Error> {
         self.inner.clone().submit_batch(news).await
     }
@@ -222,20 +215,12 @@ impl Engine {
         Watch::open(self.inner.clone(), name.clone(), after_sequence).await
     }
 
-    /// Ends a queued job, asks a running one to stop, leaves an ended one as it is. Returns the job as it stands then:
-    /// a running one ends soon after, which its events tell.
-    ///
-    /// # Errors
-    /// [`StoreError::NotFound`].
-    pub async fn cancel(&self, name: &JobName) -> Result<Job, Error> {
-        self.cancel_as_of(name, None).await
-    }
-
-    /// The same, only where the etag is the job's.
+    /// Ends a queued job, asks a running one to stop, leaves an ended one as it is; with an etag, only where it is the
+    /// job's. Returns the job as it stands then: a running one ends soon after, which its events tell.
     ///
     /// # Errors
     /// [`StoreError::NotFound`], [`StoreError::EtagMismatch`].
-    pub async fn cancel_as_of(&self, name: &JobName, etag: Option<String>) -> Result<Job, Error> {
+    pub async fn cancel(&self, name: &JobName, etag: Option<String>) -> Result<Job, Error> {
         let (inner, name) = (self.inner.clone(), name.clone());
         // On its own task: a caller that goes away must not leave a stored cancel untold.
         finished(tokio::spawn(async move { inner.cancel(&name, etag.as_deref()).await })).await

@@ -63,11 +63,6 @@ impl Notifier {
             held.channel.version.send_modify(|version| *version = version.wrapping_add(1));
         }
     }
-
-    #[cfg(test)]
-    pub(super) fn channel_count(&self) -> usize {
-        locked(&self.channels).len()
-    }
 }
 
 impl Subscription {
@@ -93,6 +88,12 @@ mod tests {
     use std::sync::Barrier;
 
     use super::*;
+
+    impl Notifier {
+        pub(in crate::engine) fn channel_count(&self) -> usize {
+            locked(&self.channels).len()
+        }
+    }
 
     #[test]
     fn subscriptions_that_end_together_leave_no_channel_behind() {

@@ -179,11 +179,6 @@ impl NewJob {
 }
 
 impl Inner {
-    pub(super) async fn submit(self: Arc<Self>, new: NewJob) -> Result<Job, Error> {
-        let job = self.submit_batch(vec![new]).await?.pop();
-        job.ok_or_else(|| Error::Internal("one job was to be stored, none was".into()))
-    }
-
     pub(super) async fn submit_batch(self: Arc<Self>, news: Vec<NewJob>) -> Result<Vec<Job>, Error> {
         news.iter().try_for_each(|new| new.validate(self.options.webhooks.as_ref()))?;
         if self.phase() != Phase::Open {

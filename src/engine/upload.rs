@@ -107,6 +107,8 @@ impl Engine {
 }
 
 impl Inner {
+    /// Refuses what is new while the server drains.
+    ///
     /// # Errors
     /// [`Error::Draining`].
     fn check_open(&self) -> Result<(), Error> {

@@ -110,13 +110,6 @@ impl Worker {
         Ok(Self { assignments })
     }
 
-    /// Feeds who reads from the inbox.
-    #[cfg(test)]
-    pub(super) fn with_inbox() -> (Self, mpsc::Receiver<Assigned>) {
-        let (assignments, inbox) = mpsc::channel(1);
-        (Self { assignments }, inbox)
-    }
-
     /// Hands over work, which is begun once what was handed over before is done; waits where that is not begun either.
     pub(super) async fn assign(&self, assignment: Assignment) -> AttemptHandle {
         let (started, heard_started) = oneshot::channel();
@@ -259,6 +252,15 @@ pub(super) struct Simulated {
     reporter: Reporter,
     stop: StopToken,
     reply: oneshot::Sender<(AttemptOutcome, Attempt)>,
+}
+
+#[cfg(test)]
+impl Worker {
+    /// Feeds who reads from the inbox.
+    pub(super) fn with_inbox() -> (Self, mpsc::Receiver<Assigned>) {
+        let (assignments, inbox) = mpsc::channel(1);
+        (Self { assignments }, inbox)
+    }
 }
 
 #[cfg(test)]

@@ -36,7 +36,7 @@ impl proto::admin_service_server::AdminService for Admin {
 
     async fn pause_queue(&self, request: Request<proto::PauseQueueRequest>) -> Result<Response<proto::Queue>, Status> {
         let (caller, engine) = (Caller::of(&request)?, self.engine.clone());
-        let work = async move { engine.pause().await };
+        let work = async move { engine.set_paused(true).await };
         caller.audited("PauseQueue", "queue", work).await?;
         self.queue().await
     }
@@ -46,7 +46,7 @@ impl proto::admin_service_server::AdminService for Admin {
         request: Request<proto::ResumeQueueRequest>,
     ) -> Result<Response<proto::Queue>, Status> {
         let (caller, engine) = (Caller::of(&request)?, self.engine.clone());
-        let work = async move { engine.resume().await };
+        let work = async move { engine.set_paused(false).await };
         caller.audited("ResumeQueue", "queue", work).await?;
         self.queue().await
     }

@@ -10,7 +10,7 @@ use tracing::Instrument;
 use super::caller::Caller;
 use super::convert::enums::Twin;
 use super::convert::{count_to_wire, job, settings, size_to_wire};
-use super::disconnect::{AttachedCall, DisconnectTracker};
+use super::disconnect::DisconnectTracker;
 use super::inflight::Permit;
 use super::inputs::MAX_CHUNK_BYTES;
 use super::jobs::MAX_BATCH;
@@ -62,21 +62,6 @@ impl Calibration {
         }
         Ok(submission)
     }
-
-    /// Stores the job and attaches to it; the permit is held until then.
-    async fn submit(&self, caller: &Caller, new: engine::NewJob, permit: Permit) -> Result<AttachedCall, Status> {
-        let (caller, engine, disconnects) = (caller.clone(), self.engine.clone(), self.disconnects.clone());
-        let new = engine::NewJob { cancel_on_disconnect: true, ..new };
-        // In a task of its own: if this call is dropped while the job is being stored, it attaches all the same, and
-        // detaches when the task's outcome is dropped.
-        let stored = async move {
-            let _permit = permit;
-            let stored = engine.submit(new).await.map_err(Status::from);
-            caller.audit_jobs("Solve", stored.as_ref().map(std::slice::from_ref));
-            stored.map(|job| disconnects.attached(job))
-        };
-        tokio::spawn(stored.in_current_span()).await.map_err(|error| status::internal(&error))?
-    }
 }
 
 fn upload_limits(options: &UploadOptions) -> proto::UploadLimits {
@@ -116,7 +101,12 @@ impl proto::calibration_service_server::CalibrationService for Calibration {
             let submission = self.receive(&caller, &permit, request.into_inner()).await?;
             let trace_parent = telemetry::tracing::traceparent_to_store(&span, caller.trace_parent());
             let new = submission.close(trace_parent).await?;
-            let call = self.submit(&caller, new, permit).await?;
+            let new = engine::NewJob { cancel_on_disconnect: true, ..new };
+            let disconnects = self.disconnects.clone();
+            // If this call is dropped while the job is being stored, it attaches all the same, and detaches when what
+            // it attached by is dropped.
+            let attach = move |job| disconnects.attached(job);
+            let call = submission::store_one(&caller, "Solve", &self.engine, new, permit, attach).await?;
             telemetry::tracing::record_job(&span, call.job());
             Ok::<_, Status>(call)
         };

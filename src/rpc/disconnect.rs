@@ -56,7 +56,7 @@ impl DisconnectTracker {
             if !is_same || job.state.is_terminal() {
                 return;
             }
-            match self.engine.cancel_as_of(name, Some(job.etag())).await {
+            match self.engine.cancel(name, Some(job.etag())).await {
                 Ok(_) => return tracing::info!(job = %name, "cancelled: every Solve that waited was disconnected"),
                 // It has changed between the two, and perhaps a call has attached.
                 Err(engine::Error::Store(StoreError::EtagMismatch(_))) => {}

@@ -137,9 +137,7 @@ impl proto::job_service_server::JobService for Jobs {
             let submission = Submission::open(&caller, request.into_inner(), &self.limits, &permit)?;
             let trace_parent = telemetry::tracing::traceparent_to_store(&span, caller.trace_parent());
             let new = submission.close(trace_parent).await?;
-            let stored = submission::store(&caller, "CreateJob", &self.engine, vec![new], permit, Status::from).await?;
-            let created =
-                stored.into_iter().next().ok_or_else(|| status::internal(&"one job was to be stored, none was"))?;
+            let created = submission::store_one(&caller, "CreateJob", &self.engine, new, permit, |job| job).await?;
             telemetry::tracing::record_job(&span, &created.name);
             Ok(Response::new(job::to_wire(&created)))
         };
@@ -160,7 +158,9 @@ impl proto::job_service_server::JobService for Jobs {
             let trace_parent = telemetry::tracing::traceparent_to_store(&span, caller.trace_parent());
             let news = self.read_batch(&caller, &parent, requests, trace_parent, &permit).await?;
             let refusal = status::of_batch;
-            let created = submission::store(&caller, "BatchCreateJobs", &self.engine, news, permit, refusal).await?;
+            let jobs = |jobs| jobs;
+            let created =
+                submission::store(&caller, "BatchCreateJobs", &self.engine, news, permit, refusal, jobs).await?;
             Ok(Response::new(proto::BatchCreateJobsResponse { jobs: created.iter().map(job::to_wire).collect() }))
         };
         created.instrument(span.clone()).await
@@ -211,7 +211,7 @@ impl proto::job_service_server::JobService for Jobs {
         let name = caller.job(&request.get_ref().name)?;
         let etag = Some(request.into_inner().etag).filter(|etag| !etag.is_empty());
         let (engine, resource) = (self.engine.clone(), name.clone());
-        let cancel = async move { engine.cancel_as_of(&name, etag).await };
+        let cancel = async move { engine.cancel(&name, etag).await };
         let cancelled = caller.audited("CancelJob", resource, cancel).await?;
         Ok(Response::new(job::to_wire(&cancelled)))
     }

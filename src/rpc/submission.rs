@@ -135,25 +135,41 @@ impl Submission {
 /// or are refused: a call that is dropped meanwhile ends neither.
 ///
 /// * `refusal`: what a refusal of the engine is to the caller
+/// * `then`: what becomes of the stored jobs, also of those whose call was dropped
 ///
 /// # Errors
 /// As [`Engine::submit_batch`].
-pub async fn store(
+pub async fn store<T: Send + 'static>(
     caller: &Caller,
     method: &'static str,
     engine: &Engine,
     news: Vec<NewJob>,
     permit: Permit,
     refusal: fn(engine::Error) -> Status,
-) -> Result<Vec<Job>, Status> {
+    then: impl FnOnce(Vec<Job>) -> T + Send + 'static,
+) -> Result<T, Status> {
     let (caller, engine) = (caller.clone(), engine.clone());
     let storing = async move {
         let _permit = permit;
         let stored = engine.submit_batch(news).await.map_err(refusal);
         caller.audit_jobs(method, stored.as_deref());
-        stored
+        stored.map(then)
     };
     tokio::spawn(storing.in_current_span()).await.map_err(|error| status::internal(&error))?
+}
+
+/// The same of one job.
+pub async fn store_one<T: Send + 'static>(
+    caller: &Caller,
+    method: &'static str,
+    engine: &Engine,
+    new: NewJob,
+    permit: Permit,
+    then: impl FnOnce(Job) -> T + Send + 'static,
+) -> Result<T, Status> {
+    let first = |jobs: Vec<Job>| jobs.into_iter().next().map(then);
+    let stored = store(caller, method, engine, vec![new], permit, Status::from, first).await?;
+    stored.ok_or_else(|| status::internal(&"one job was to be stored, none was"))
 }
 
 /// The next message of a stream that brings an input; its bytes are charged as the largest so far.

@@ -1,4 +1,4 @@
-//! The state that outlives the process: jobs, inputs, events, results, leases and request ids, behind one trait.
+//! The state that outlives the process: jobs, inputs, events, results, leases and request ids, behind one type.
 //!
 //! Only this module sees SQL, but for `formats`, which reads COLMAP's databases. Depends on `domain` and `telemetry`;
 //! the state machine's rules are the domain's, what is written in one transaction is decided here.
@@ -9,14 +9,14 @@ pub mod payload;
 pub mod postgres;
 pub mod query;
 pub mod record;
-#[cfg(test)]
-pub(crate) mod simulated;
 mod sql;
 pub mod sqlite;
 pub mod upload;
 
 #[cfg(test)]
 mod contract;
+#[cfg(test)]
+pub(crate) mod tests;
 
 use std::path::PathBuf;
 

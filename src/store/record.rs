@@ -40,12 +40,6 @@ pub enum JobInput {
     Uploaded { input: String, bytes: u64 },
 }
 
-impl From<Vec<u8>> for JobInput {
-    fn from(payload: Vec<u8>) -> Self {
-        JobInput::Inline(payload)
-    }
-}
-
 impl JobInput {
     /// The id of the uploaded input, where it is one.
     pub fn uploaded(&self) -> Option<&str> {
@@ -155,21 +149,6 @@ pub struct Claim {
     /// Lost attempts from which on a job is a suspect, which is leased, not begun. `None`: nothing else runs in the
     /// process, so that a suspect may be begun.
     pub suspect_after: Option<u32>,
-}
-
-impl Claim {
-    /// Of the next job alone, where all tenants have equal shares, by a process in which nothing else runs.
-    pub fn one(worker: &str, lease_for: Duration) -> Self {
-        Self {
-            worker: worker.into(),
-            lease_for,
-            begin: None,
-            prefetch: None,
-            shares: Arc::default(),
-            solved: Vec::new(),
-            suspect_after: None,
-        }
-    }
 }
 
 /// A job that is leased ahead of its begin.

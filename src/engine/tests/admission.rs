@@ -18,7 +18,7 @@ async fn a_full_queue_refuses_at_once_and_takes_on_again() {
         }
         other => panic!("{other:?}"),
     }
-    test.engine.cancel(&waiting).await.expect("exists");
+    test.engine.cancel(&waiting, None).await.expect("exists");
     test.submit(Behavior::Wait).await;
 }
 
@@ -94,7 +94,7 @@ async fn job_ids_are_the_callers_or_made() {
     assert!(JobName::parse(&made.to_string()).is_some(), "{made}");
     let missing = JobName { tenant: "other".into(), job: "mine".into() };
     assert_eq!(test.engine.job(&missing).await, Err(StoreError::NotFound(missing.clone()).into()));
-    assert_eq!(test.engine.cancel(&missing).await, Err(StoreError::NotFound(missing.clone()).into()));
+    assert_eq!(test.engine.cancel(&missing, None).await, Err(StoreError::NotFound(missing.clone()).into()));
     assert_eq!(test.engine.watch(&missing, 0).await.map(|_| ()), Err(StoreError::NotFound(missing).into()));
 }
 

@@ -79,16 +79,16 @@ async fn a_cancel_reaches_a_queued_a_running_and_no_ended_job() {
     let queued = test.submit(Behavior::Wait).await;
 
     let mut watch = test.engine.watch(&queued, 1).await.expect("exists");
-    assert_eq!(test.engine.cancel(&queued).await.expect("exists").state, JobState::Cancelled);
+    assert_eq!(test.engine.cancel(&queued, None).await.expect("exists").state, JobState::Cancelled);
     let events = rest(&mut watch).await;
     assert_eq!(events.iter().map(terminal).collect::<Vec<_>>(), [Some(JobState::Cancelled)]);
 
     assert_eq!(test.engine.result(&running).await, Err(Error::NotReady(JobState::Running)));
-    let flagged = test.engine.cancel(&running).await.expect("exists");
+    let flagged = test.engine.cancel(&running, None).await.expect("exists");
     assert!(flagged.state == JobState::Running && flagged.cancel_requested, "{flagged:?}");
     let job = test.ended(&running).await;
     assert_eq!((job.state, job.cancel_requested), (JobState::Cancelled, false));
-    assert_eq!(test.engine.cancel(&running).await, Ok(job));
+    assert_eq!(test.engine.cancel(&running, None).await, Ok(job));
     assert_eq!(test.solver.calls.load(Ordering::SeqCst), 1, "the queued job was never begun");
 }
 

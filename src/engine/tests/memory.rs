@@ -67,9 +67,9 @@ async fn while_a_job_waits_for_memory_no_other_one_is_claimed() {
     tokio::time::sleep(Duration::from_millis(100)).await;
     let job = test.engine.job(&third).await.expect("exists");
     assert_eq!((job.state, job.attempt), (JobState::Queued, 0));
-    test.engine.cancel(&second).await.expect("exists");
+    test.engine.cancel(&second, None).await.expect("exists");
     runs(&test, &third).await;
-    test.engine.cancel(&first).await.expect("exists");
+    test.engine.cancel(&first, None).await.expect("exists");
     assert_eq!(test.ended(&third).await.state, JobState::Succeeded);
 }
 
@@ -80,7 +80,7 @@ async fn a_job_that_does_not_fit_now_waits_and_heeds_cancel_and_deadline() {
     test.solver.until_waiting(1).await;
     let cancelled = test.submit(Behavior::Wait).await;
     runs(&test, &cancelled).await;
-    test.engine.cancel(&cancelled).await.expect("exists");
+    test.engine.cancel(&cancelled, None).await.expect("exists");
     assert_eq!(test.ended(&cancelled).await.state, JobState::Cancelled);
     let soon = Some(Deadline::After(Duration::from_millis(300)));
     let due = test.engine.submit(NewJob { deadline: soon, ..new_job(Behavior::Wait) }).await.expect("admitted").name;
@@ -88,7 +88,7 @@ async fn a_job_that_does_not_fit_now_waits_and_heeds_cancel_and_deadline() {
     let last = test.submit(Behavior::Succeed).await;
     runs(&test, &last).await;
     assert_eq!(test.solver.calls.load(Ordering::SeqCst), 1, "none of them was solved beside the first");
-    test.engine.cancel(&first).await.expect("exists");
+    test.engine.cancel(&first, None).await.expect("exists");
     let job = test.ended(&last).await;
     assert_eq!((job.state, job.attempt), (JobState::Succeeded, 1));
     assert_eq!(call_of(&test.engine, &last).await, 2);
@@ -117,7 +117,7 @@ async fn a_drain_gives_a_job_that_waits_for_memory_back_at_once() {
     let release = async {
         let is_queued = async || test.engine.job(&second).await.expect("exists").state == JobState::Queued;
         eventually(|| async { is_queued().await.then_some(()) }).await;
-        test.engine.cancel(&first).await.expect("exists");
+        test.engine.cancel(&first, None).await.expect("exists");
     };
     let (drained, ()) = tokio::join!(test.engine.drain(Duration::from_secs(600)), release);
     assert_eq!(drained, Drained { finished: 1, given_back: 1 });

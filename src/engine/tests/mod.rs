@@ -17,7 +17,7 @@ use std::time::Duration;
 
 use tempfile::TempDir;
 
-use super::{Engine, NewJob, Options, Solver};
+use super::{Engine, Error, NewJob, Options, Solver};
 use crate::domain::job::{DEFAULT_TENANT, EventBody, Job, JobEvent, JobName, JobState};
 use crate::domain::{
     Input, Limits, Method, Observer, Progress, RawInput, ReconstructionProgress, Solution, SolveSettings, Stage,
@@ -174,6 +174,13 @@ fn input() -> Input {
 
 fn new_job(behavior: Behavior) -> NewJob {
     NewJob::new(DEFAULT_TENANT, input(), SolveSettings { seed: behavior as u64, ..SolveSettings::default() })
+}
+
+impl Engine {
+    /// Admits and stores one job.
+    async fn submit(&self, new: NewJob) -> Result<Job, Error> {
+        Ok(self.submit_batch(vec![new]).await?.pop().expect("one of one"))
+    }
 }
 
 /// An engine over a store in a directory of its own.

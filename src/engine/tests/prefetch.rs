@@ -85,7 +85,7 @@ async fn behind_a_job_that_turns_out_long_nothing_is_prefetched_any_more() {
 #[tokio::test]
 async fn cancelled_before_it_is_begun_it_ends_so_whoever_has_it() {
     let (test, [solved, next]) = prefetched().await;
-    assert_eq!(test.engine.cancel(&next).await.expect("exists").state, JobState::Cancelled);
+    assert_eq!(test.engine.cancel(&next, None).await.expect("exists").state, JobState::Cancelled);
     let third = test.submit(Behavior::Succeed).await;
     test.solver.release();
     for name in [&solved, &third] {
@@ -127,7 +127,7 @@ async fn what_was_begun_and_cannot_be_leased_is_stopped_and_solved_later() {
         let no_claims = "CREATE TRIGGER broken BEFORE UPDATE OF state ON jobs WHEN NEW.state = 'RUNNING' \
                          BEGIN SELECT RAISE(ABORT, 'broken'); END";
         test.store.execute(no_claims).await;
-        test.engine.cancel(first).await.expect("exists");
+        test.engine.cancel(first, None).await.expect("exists");
         // It is until its claim has failed.
         eventually(|| async { (!is_prefetched(&test, next)).then_some(()) }).await;
         if test.solver.waiting.load(Ordering::SeqCst) < 2 {
@@ -184,7 +184,7 @@ async fn what_an_idle_worker_can_take_waits_for_no_other() {
         let both = vec![new_job(Behavior::Wait), new_job(Behavior::Succeed)];
         let created = test.engine.submit_batch(both).await.expect("admitted");
         assert_eq!(test.ended(&created[1].name).await.state, JobState::Succeeded, "round {round}");
-        test.engine.cancel(&created[0].name).await.expect("exists");
+        test.engine.cancel(&created[0].name, None).await.expect("exists");
         test.ended(&created[0].name).await;
     }
 }

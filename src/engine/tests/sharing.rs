@@ -21,7 +21,7 @@ async fn without_notifications_a_job_is_watched_and_cancelled_from_elsewhere() {
     solver.until_waiting(1).await;
     let other = engines.iter().find(|engine| super::super::locked(&engine.inner.running).is_empty());
     let mut watch = other.expect("one of them idles").watch(&name, 0).await.expect("exists");
-    other.expect("one of them idles").cancel(&name).await.expect("flags");
+    other.expect("one of them idles").cancel(&name, None).await.expect("flags");
     let events = rest(&mut watch).await;
     assert_contiguous(&events, 1);
     assert_eq!(events.last().and_then(terminal), Some(JobState::Cancelled));

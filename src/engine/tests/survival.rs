@@ -227,12 +227,12 @@ async fn a_job_that_lost_attempts_waits_until_it_is_alone_and_others_wait_for_it
     let test = TestEngine::start(workers(2)).await;
     let running = test.submit(Behavior::Wait).await;
     test.solver.until_waiting(1).await;
-    test.engine.pause().await.expect("pauses");
+    test.engine.set_paused(true).await.expect("pauses");
     let suspect = NewJob { priority: 9, ..new_job(Behavior::Wait) };
     let suspect = test.engine.submit(suspect).await.expect("admitted").name;
     test.store.execute("UPDATE jobs SET lost_attempts = 2 WHERE priority = 9").await;
     let other = test.submit(Behavior::Succeed).await;
-    test.engine.resume().await.expect("resumes");
+    test.engine.set_paused(false).await.expect("resumes");
     // Nobody gets a permit once the suspect waits for all of them.
     eventually(|| async { test.engine.inner.limits.try_acquire().is_none().then_some(()) }).await;
     for name in [&suspect, &other] {
@@ -240,7 +240,7 @@ async fn a_job_that_lost_attempts_waits_until_it_is_alone_and_others_wait_for_it
         assert_eq!((job.state, job.attempt), (JobState::Queued, 0), "no attempt waits");
     }
 
-    test.engine.cancel(&running).await.expect("exists");
+    test.engine.cancel(&running, None).await.expect("exists");
     test.solver.until_waiting(2).await;
     assert_eq!(test.engine.job(&suspect).await.expect("exists").state, JobState::Running);
     assert_eq!(test.engine.job(&other).await.expect("exists").state, JobState::Queued);
@@ -259,11 +259,11 @@ async fn a_suspect_that_waits_is_cancelled_and_left_by_a_drain_as_any_job_that_w
         let test = TestEngine::start(Options { lease: Duration::from_secs(3), ..workers(2) }).await;
         let running = test.submit(Behavior::Wait).await;
         test.solver.until_waiting(1).await;
-        test.engine.pause().await.expect("pauses");
+        test.engine.set_paused(true).await.expect("pauses");
         let suspect = NewJob { priority: 9, ..new_job(Behavior::Wait) };
         let suspect = test.engine.submit(suspect).await.expect("admitted").name;
         test.store.execute("UPDATE jobs SET lost_attempts = 2 WHERE priority = 9").await;
-        test.engine.resume().await.expect("resumes");
+        test.engine.set_paused(false).await.expect("resumes");
         eventually(|| async { test.engine.inner.limits.try_acquire().is_none().then_some(()) }).await;
         if drains {
             test.engine.drain(Duration::ZERO).await;
@@ -273,7 +273,7 @@ async fn a_suspect_that_waits_is_cancelled_and_left_by_a_drain_as_any_job_that_w
             let begun = test.store.claim(&claim, SystemTime::now()).await.expect("claims").begun;
             assert_eq!(begun.expect("a job").job.name, suspect, "it was given back");
         } else {
-            test.engine.cancel(&suspect).await.expect("exists");
+            test.engine.cancel(&suspect, None).await.expect("exists");
             let other = test.submit(Behavior::Succeed).await;
             assert_eq!(test.ended(&other).await.state, JobState::Succeeded, "beside the one that runs");
             assert_eq!(test.ended(&suspect).await.attempt, 0);
@@ -285,12 +285,12 @@ async fn a_suspect_that_waits_is_cancelled_and_left_by_a_drain_as_any_job_that_w
 #[tokio::test]
 async fn of_several_suspects_a_server_keeps_one_and_leaves_the_others_to_other_servers() {
     let test = TestEngine::start(Options { lease: Duration::from_secs(3_600), ..workers(3) }).await;
-    test.engine.pause().await.expect("pauses");
+    test.engine.set_paused(true).await.expect("pauses");
     for _ in 0..3 {
         test.submit(Behavior::Wait).await;
     }
     test.store.execute("UPDATE jobs SET lost_attempts = 2").await;
-    test.engine.resume().await.expect("resumes");
+    test.engine.set_paused(false).await.expect("resumes");
     test.solver.until_waiting(1).await;
     let claim = Claim { suspect_after: Some(2), ..Claim::one("another", Duration::from_secs(3_600)) };
     for _ in 0..2 {
@@ -303,13 +303,13 @@ async fn of_several_suspects_a_server_keeps_one_and_leaves_the_others_to_other_s
 async fn a_suspect_is_kept_while_the_store_fails_and_begun_once() {
     // Long enough that the store is back before the lease runs out.
     let test = TestEngine::start(Options { lease: Duration::from_secs(600), ..workers(1) }).await;
-    test.engine.pause().await.expect("pauses");
+    test.engine.set_paused(true).await.expect("pauses");
     let suspect = test.submit(Behavior::Succeed).await;
     test.store.execute("UPDATE jobs SET lost_attempts = 2").await;
     let broken = "CREATE TRIGGER broken BEFORE UPDATE OF state ON jobs WHEN new.state = 'RUNNING' \
                   BEGIN SELECT RAISE(ABORT, 'broken'); END";
     test.store.execute(broken).await;
-    test.engine.resume().await.expect("resumes");
+    test.engine.set_paused(false).await.expect("resumes");
     // Its begin fails, again and again.
     eventually(|| async { test.engine.inner.limits.try_acquire().is_none().then_some(()) }).await;
     tokio::time::sleep(Duration::from_secs(1)).await;
@@ -404,7 +404,7 @@ async fn a_cancel_reaches_the_attempt_that_holds_the_lease_though_another_still_
     test.solver.until_waiting(1).await;
     test.store.sweep(SystemTime::now() + Duration::from_secs(4000), 3).await.expect("sweeps");
     test.solver.until_waiting(2).await;
-    test.engine.cancel(&name).await.expect("exists");
+    test.engine.cancel(&name, None).await.expect("exists");
     let tokens: Vec<_> = locked(&test.engine.inner.running).values().map(|listed| listed.stop.is_stopped()).collect();
     assert_eq!(tokens, [true, true]);
     test.solver.release();

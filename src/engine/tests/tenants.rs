@@ -47,7 +47,7 @@ async fn of_a_tenant_no_more_jobs_run_than_it_may() {
         assert_eq!(test.ended(&other).await.state, JobState::Succeeded);
     }
     assert_eq!(test.engine.job(&both[1].name).await.expect("exists").state, JobState::Queued);
-    test.engine.cancel(&both[0].name).await.expect("exists");
+    test.engine.cancel(&both[0].name, None).await.expect("exists");
     eventually(|| async {
         let job = test.engine.job(&both[1].name).await.expect("exists");
         (job.state == JobState::Running).then_some(())

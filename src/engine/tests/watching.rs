@@ -32,7 +32,7 @@ async fn a_slow_watcher_gets_the_latest_weights_only() {
     test.solver.until_waiting(1).await;
     let name = test.submit(Behavior::Weights).await;
     let mut watch = test.engine.watch(&name, 0).await.expect("exists");
-    test.engine.cancel(&blocker).await.expect("exists");
+    test.engine.cancel(&blocker, None).await.expect("exists");
     test.solver.until_waiting(2).await;
     let mut late = test.engine.watch(&name, 0).await.expect("exists");
     let mut events = up_to_weights(&mut watch).await;

@@ -17,7 +17,7 @@ use std::time::{Duration, SystemTime};
 use crate::domain::job::{AttemptEnd, EventBody, Failure, Job, JobName, JobState, PastAttempt, Summary};
 use crate::domain::{Progress, ReconstructionProgress, SolveSettings, Stage, Status, Step, Task};
 use crate::store::postgres::Postgres;
-use crate::store::record::{NewRecord, Request};
+use crate::store::record::{JobInput, NewRecord, Request};
 use crate::store::sqlite::Sqlite;
 use crate::store::{
     ATTEMPTS_EXHAUSTED, Bound, Changed, Claim, Claimed, EncodedResult, Ending, Error, JobQuery, Lease, Order, Outcome,
@@ -149,6 +149,27 @@ impl Store {
         now: SystemTime,
     ) -> Result<Changed, Error> {
         Ok(self.create_jobs(vec![new], bounds, now).await?.pop().expect("one of one"))
+    }
+}
+
+impl Claim {
+    /// Of the next job alone, where all tenants have equal shares, by a process in which nothing else runs.
+    pub(crate) fn one(worker: &str, lease_for: Duration) -> Self {
+        Self {
+            worker: worker.into(),
+            lease_for,
+            begin: None,
+            prefetch: None,
+            shares: Arc::default(),
+            solved: Vec::new(),
+            suspect_after: None,
+        }
+    }
+}
+
+impl From<Vec<u8>> for JobInput {
+    fn from(payload: Vec<u8>) -> Self {
+        JobInput::Inline(payload)
     }
 }
 

@@ -8,7 +8,7 @@ use super::client::{Clients, Known, request};
 use super::server::{JobBehavior, Solving};
 use super::{MAX_ATTEMPTS, MAX_JOBS, beginning};
 use crate::domain::job::{EventBody, Job, JobEvent, JobName, JobState};
-use crate::store::simulated::Cluster;
+use crate::store::tests::simulated::Cluster;
 use crate::store::{ATTEMPTS_EXHAUSTED, Error, Store};
 
 macro_rules! ensure {

@@ -118,7 +118,7 @@ impl Clients {
     pub(super) fn set_paused(&self, server: &Server, paused: bool) {
         let history = self.history.clone();
         server.spawn(move |engine| async move {
-            let answer = if paused { engine.pause().await } else { engine.resume().await };
+            let answer = engine.set_paused(paused).await;
             match answer {
                 Ok(()) => {}
                 Err(error) if is_failure(&error) => {}
@@ -171,7 +171,7 @@ async fn submit(engine: Engine, number: u64, history: Arc<Mutex<History>>) {
 }
 
 async fn cancel(engine: Engine, name: JobName, history: Arc<Mutex<History>>) {
-    match engine.cancel(&name).await {
+    match engine.cancel(&name, None).await {
         Ok(_) => {}
         Err(error) if is_failure(&error) => {}
         Err(Error::Store(StoreError::NotFound(_)))

@@ -1,7 +1,7 @@
 //! Engines and their stores under simulated time, networks and disks, with faults by seed: a failing seed replays.
 //!
 //! Each server is a tokio runtime of one thread with a paused clock, and all of them go forward together, step by step.
-//! What runs is the engine, and the SQL that ships, on a SQLite in memory (`store::simulated`). Not simulated are
+//! What runs is the engine, and the SQL that ships, on a SQLite in memory (`store::tests::simulated`). Not simulated are
 //! worker threads, which are tasks here, and PostgreSQL's locks: see `tests/it/replicas.rs` for a real one.
 
 mod check;
@@ -17,7 +17,7 @@ use rand_chacha::ChaCha8Rng;
 
 use self::client::Clients;
 use self::server::{Server, Solving};
-use crate::store::simulated::{Bug, Cluster, Faults};
+use crate::store::tests::simulated::{Bug, Cluster, Faults};
 
 /// By which all servers go forward.
 const STEP: Duration = Duration::from_millis(50);

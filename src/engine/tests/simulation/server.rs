@@ -17,7 +17,7 @@ use crate::engine::tests::{input, progress, solution};
 use crate::engine::worker::{Assigned, Worker};
 use crate::engine::{Drained, Engine, Error, Options};
 use crate::store::TenantShares;
-use crate::store::simulated::{Faults, Link, Simulated};
+use crate::store::tests::simulated::{Faults, Link, Simulated};
 
 /// What becomes of a job, by its settings' seed.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]

@@ -13,10 +13,10 @@ use rand_chacha::ChaCha8Rng;
 use tokio::sync::{OwnedMutexGuard, broadcast};
 use tokio::time::{Instant, sleep};
 
-use super::clock::LeaseClock;
-use super::sql::{Connection, Database, Operation, Row, Size, Statement, WriteIntent, micros};
-use super::sqlite::WriteConnection;
-use super::{Clock, Error, Notification, Store};
+use crate::store::clock::LeaseClock;
+use crate::store::sql::{Connection, Database, Operation, Row, Size, Statement, WriteIntent, micros};
+use crate::store::sqlite::WriteConnection;
+use crate::store::{Clock, Error, Notification, Store};
 
 /// Notifications that a server may be behind before it is told that some are lost.
 const NOTIFICATIONS: usize = 16;

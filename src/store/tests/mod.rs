@@ -1,0 +1,3 @@
+//! What tests have in the place of a database.
+
+pub(crate) mod simulated;
