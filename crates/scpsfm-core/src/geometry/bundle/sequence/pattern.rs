@@ -148,15 +148,10 @@ impl Pattern {
         self.strides[column]
     }
 
-    /// A block column, whose rows can be looked up.
+    /// A block column.
     pub fn column(&self, column: usize) -> Column<'_> {
         let range = self.column_starts[column]..self.column_starts[column + 1];
-        Column {
-            rows: &self.rows[range.clone()],
-            heights: &self.heights[range],
-            start: self.panel_starts[column],
-            at: 0,
-        }
+        Column { rows: &self.rows[range.clone()], heights: &self.heights[range], start: self.panel_starts[column] }
     }
 
     /// Where a block is; `None` where it is zero.
@@ -190,12 +185,11 @@ impl Pattern {
     }
 }
 
-/// A block column whose rows are looked up in ascending order.
+/// A block column.
 pub(super) struct Column<'a> {
     rows: &'a [u32],
     heights: &'a [u32],
     start: usize,
-    at: usize,
 }
 
 impl<'a> Column<'a> {
@@ -203,16 +197,15 @@ impl<'a> Column<'a> {
         self.rows
     }
 
-    /// Where a row block starts among the values; rows must be asked for in ascending order.
+    /// Where a row block starts among the values; `None` where it is not listed.
     #[inline]
-    pub fn start_of(&mut self, row: u32) -> Option<usize> {
-        // Neighbours in a track are mostly neighbours in the list; else it is searched.
-        if self.rows.get(self.at) != Some(&row) {
-            self.at += 1;
-            if self.rows.get(self.at) != Some(&row) {
-                self.at = self.rows.binary_search(&row).ok()?;
-            }
-        }
-        Some(self.start + self.heights[self.at] as usize)
+    pub fn start_of(&self, row: u32) -> Option<usize> {
+        // Rows ascend without repeats, so that a row is at most so many places down; mostly it is just there.
+        let last = row.checked_sub(*self.rows.first()?)? as usize;
+        let at = match self.rows.get(last) {
+            Some(listed) if *listed == row => last,
+            _ => self.rows[..last.min(self.rows.len())].binary_search(&row).ok()?,
+        };
+        Some(self.start + self.heights[at] as usize)
     }
 }

@@ -252,7 +252,7 @@ impl Columns<'_> {
                         + right[size + k] * whitened_gradient[1]
                         + right[2 * size + k] * whitened_gradient[2];
                 }
-                let mut places: Column = pattern.column(column);
+                let places: Column = pattern.column(column);
                 for row in &incident_blocks[first..] {
                     // Pattern and incident blocks come from the same layout, so that there is a place.
                     let Some(start) = places.start_of(row.block) else { continue };
