@@ -3,7 +3,7 @@
 use std::sync::Arc;
 
 use crate::domain::{RawInput, RawMatches};
-use crate::rpc::convert::set::Set;
+use crate::rpc::convert::input_message::InputMessage;
 use crate::rpc::convert::{input, matches};
 use crate::rpc::proto::{self, create_job_request::Source, input_data::Data, solve_request::Message};
 

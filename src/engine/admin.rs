@@ -24,8 +24,8 @@ impl Engine {
         Ok(self.inner.dated(self.inner.store.set_priority(name, etag, priority).await?))
     }
 
-    /// Pauses the queue, so that no server of the store begins a job, also after a restart, or ends the pause. What
-    /// runs goes on.
+    /// Pauses the queue, or ends the pause. While it is paused no server of the store begins a job, also after a
+    /// restart. What runs goes on.
     ///
     /// # Errors
     /// [`StoreError::Unavailable`].

@@ -40,7 +40,7 @@ const MAX_PREFETCH_OBSERVATIONS: u32 = 100_000;
 pub(super) async fn run(inner: Arc<Inner>, worker: Worker) {
     let mut work = inner.work.subscribe();
     let mut phase = inner.phase.subscribe();
-    // Given up with the slot, as what is prefetched.
+    // Aborted with the slot, like the prefetched job.
     let mut committing: Option<AbortOnDropHandle<()>> = None;
     let mut prefetched: Option<Prefetched> = None;
     while *phase.borrow_and_update() == Phase::Open {
@@ -72,7 +72,7 @@ pub(super) async fn run(inner: Arc<Inner>, worker: Worker) {
         };
         if let Some(mut before) = committing.replace(AbortOnDropHandle::new(tokio::spawn(finished.finalise()))) {
             // Results that the store cannot take must not pile up, nor are jobs begun that it may not lease.
-            // It breaks off by a panic alone, which has been reported; its lease runs out.
+            // The task fails only by a panic, which has been reported; its lease runs out.
             if timeout(inner.options.short_job, &mut before).await.is_err() {
                 prefetched = None;
                 let _ = before.await;

@@ -158,9 +158,9 @@ impl proto::job_service_server::JobService for Jobs {
             let trace_parent = telemetry::tracing::traceparent_to_store(&span, caller.trace_parent());
             let news = self.read_batch(&caller, &parent, requests, trace_parent, &permit).await?;
             let refusal = status::of_batch;
-            let jobs = |jobs| jobs;
+            let all = std::convert::identity;
             let created =
-                submission::store(&caller, "BatchCreateJobs", &self.engine, news, permit, refusal, jobs).await?;
+                submission::store(&caller, "BatchCreateJobs", &self.engine, news, permit, refusal, all).await?;
             Ok(Response::new(proto::BatchCreateJobsResponse { jobs: created.iter().map(job::to_wire).collect() }))
         };
         created.instrument(span.clone()).await

@@ -159,6 +159,9 @@ pub async fn store<T: Send + 'static>(
 }
 
 /// The same of one job.
+///
+/// # Errors
+/// As [`store`].
 pub async fn store_one<T: Send + 'static>(
     caller: &Caller,
     method: &'static str,
@@ -172,7 +175,7 @@ pub async fn store_one<T: Send + 'static>(
     stored.ok_or_else(|| status::internal(&"one job was to be stored, none was"))
 }
 
-/// The next message of a stream that brings an input; its bytes are charged as the largest so far.
+/// The next message of a stream that brings an input; the permit then counts a new message.
 ///
 /// # Errors
 /// `DEADLINE_EXCEEDED` where none comes.

@@ -27,8 +27,8 @@ pub use bounds::{Bound, QueueBounds, UploadBounds};
 pub use clock::Clock;
 pub use query::{InputQuery, JobQuery, Order, Page};
 pub use record::{
-    Changed, Claim, Claimed, Claims, EncodedResult, Ending, Heartbeat, JobInput, JobPayload, Lease, NewRecord, Outcome,
-    PassedOver, Prefetch, QueueReport, QueueStats, Request, StoreStats, Swept, TenantQueue, TenantShares,
+    ChangeReply, Claim, Claimed, Claims, EncodedResult, Ending, Heartbeat, JobInput, JobPayload, Lease, NewRecord,
+    Outcome, PassedOver, Prefetch, QueueReport, QueueStats, Request, StoreStats, Swept, TenantQueue, TenantShares,
     WebhookOutcome, WebhookQueue,
 };
 pub use upload::{BegunUpload, NewInput, NewUpload, PurgedUploads, StoredInput, UploadLease, UploadStatus};

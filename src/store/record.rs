@@ -25,7 +25,7 @@ pub struct NewRecord {
     pub labels: BTreeMap<String, String>,
     /// W3C `traceparent` of the call that created the job, so that its trace goes on after a restart.
     pub trace_parent: Option<String>,
-    /// Whether the job depends on the call that creates it; see [`crate::store::Store::create_jobs`].
+    /// Whether the job depends on the call that creates it; see `Store::create_jobs`.
     pub cancel_on_disconnect: bool,
     /// Where the job's end is to be sent.
     pub webhook_url: Option<String>,
@@ -66,9 +66,9 @@ pub struct Request {
     pub digest: [u8; 32],
 }
 
-/// What a call came to that asks for a change of a job which may have been made before.
+/// Answer to a call that creates, cancels or retries a job; an earlier call may have done so.
 #[derive(Debug, Clone, PartialEq)]
-pub struct Changed {
+pub struct ChangeReply {
     /// The job as it stands now.
     pub job: Job,
     /// Whether this call made the change: it created the job, ended it, or put it into the queue.

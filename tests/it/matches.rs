@@ -2,7 +2,7 @@
 
 use std::path::{Path, PathBuf};
 
-use scpsfm::rpc::convert::set::Set;
+use scpsfm::rpc::convert::input_message::InputMessage;
 use scpsfm::rpc::proto::job_service_client::JobServiceClient;
 use scpsfm::rpc::proto::{self, create_job_request::Source, solve_request::Message};
 use serde_json::Value;

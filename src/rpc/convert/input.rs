@@ -1,6 +1,6 @@
 //! Inputs as they arrive, in one message or in chunks, and as a client sends them.
 
-use super::set::Set;
+use super::input_message::InputMessage;
 use super::{matches, matrix, size_to_wire};
 use crate::domain::{FocalPrior, ImageSize, Input, InvalidInput, Limits, RawInput, View, Violation};
 use crate::engine::StoredInput;
@@ -90,7 +90,7 @@ impl Draft {
         }
     }
 
-    /// Bytes that it takes in memory, see [`Set::bytes`].
+    /// Bytes that it takes in memory, see [`InputMessage::bytes`].
     pub fn bytes(&self) -> u64 {
         match &self.body {
             Body::TrackSet(set) => set.bytes(),
@@ -177,7 +177,7 @@ pub fn uploaded_to_wire(input: &StoredInput) -> proto::Input {
 
 #[cfg(test)]
 mod tests {
-    use super::super::set::CHUNK_ENTRIES;
+    use super::super::input_message::CHUNK_ENTRIES;
     use super::*;
 
     fn raw(observations: usize) -> RawInput {

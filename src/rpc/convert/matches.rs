@@ -38,7 +38,7 @@ pub fn to_wire(matches: RawMatches) -> proto::MatchSet {
 #[cfg(test)]
 mod tests {
     use super::super::input::Draft;
-    use super::super::set::{CHUNK_ENTRIES, Set};
+    use super::super::input_message::{CHUNK_ENTRIES, InputMessage};
     use super::*;
     use crate::domain::{Limits, View};
     use crate::rpc::proto::create_job_request::Source as Inline;

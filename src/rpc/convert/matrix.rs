@@ -1,7 +1,7 @@
 //! Measurement matrices: checked in their own terms, then read as observations, padding stripped.
 
 use super::input::view_from_wire;
-use super::set::{Set, within};
+use super::input_message::{InputMessage, within};
 use crate::domain::error::Violations;
 use crate::domain::input::too_few_views;
 use crate::domain::{Input, InvalidInput, Limits, RawInput, View, Violation};
@@ -18,7 +18,7 @@ fn field(name: &str) -> String {
 /// mostly holes is a track set.
 pub(super) fn check_size(matrix: &proto::MeasurementMatrix, limits: &Limits) -> Result<(), InvalidInput> {
     let (n, m) = (matrix.view_count as usize, matrix.track_count as usize);
-    within(MATRIX, matrix.claims(limits))?;
+    within(MATRIX, matrix.declared_counts(limits))?;
     // In u64, since two counts within their limits may still overflow 32 bits together.
     let entries = n as u64 * m as u64;
     if entries > limits.max_observations as u64 {

@@ -7,6 +7,7 @@
 pub mod create;
 pub mod enums;
 pub mod input;
+pub mod input_message;
 pub mod job;
 pub mod list;
 pub mod matches;
@@ -15,7 +16,6 @@ pub mod names;
 pub mod progress;
 pub mod result;
 mod second_structures;
-pub mod set;
 pub mod settings;
 mod time;
 pub mod upload;

@@ -5,7 +5,7 @@ use prost::bytes::Buf;
 use prost::encoding::{DecodeContext, WireType, decode_key, decode_varint, skip_field};
 
 use super::input::Draft;
-use super::set::{Array, Set, max_entries};
+use super::input_message::{Array, InputMessage, max_entries};
 use crate::domain::{InvalidInput, Limits, Violation};
 use crate::rpc::proto;
 use proto::create_job_request::Source as Inline;
@@ -66,7 +66,7 @@ fn length(buf: &mut impl Buf) -> Result<usize, InvalidInput> {
 }
 
 /// A set with the fields of a message within the message.
-fn merged<S: Set>(buf: &mut impl Buf, mut set: S, limits: &Limits) -> Result<S, InvalidInput> {
+fn merged<S: InputMessage>(buf: &mut impl Buf, mut set: S, limits: &Limits) -> Result<S, InvalidInput> {
     let length = length(buf)?;
     let end = buf.remaining() - length;
     while buf.remaining() > end {

@@ -20,8 +20,8 @@ use crate::store::postgres::Postgres;
 use crate::store::record::{JobInput, NewRecord, Request};
 use crate::store::sqlite::Sqlite;
 use crate::store::{
-    ATTEMPTS_EXHAUSTED, Bound, Changed, Claim, Claimed, EncodedResult, Ending, Error, JobQuery, Lease, Order, Outcome,
-    QueueBounds, Store, payload,
+    ATTEMPTS_EXHAUSTED, Bound, ChangeReply, Claim, Claimed, EncodedResult, Ending, Error, JobQuery, Lease, Order,
+    Outcome, QueueBounds, Store, payload,
 };
 
 /// Runs the contract: `$open` is an async function without arguments whose result, where the database is there, derefs
@@ -147,7 +147,7 @@ impl Store {
         new: NewRecord,
         bounds: &QueueBounds,
         now: SystemTime,
-    ) -> Result<Changed, Error> {
+    ) -> Result<ChangeReply, Error> {
         Ok(self.create_jobs(vec![new], bounds, now).await?.pop().expect("one of one"))
     }
 }

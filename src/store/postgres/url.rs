@@ -5,7 +5,7 @@ use std::str::FromStr;
 
 use serde::{Deserialize, Deserializer, Serialize, Serializer};
 use sqlx::postgres::PgConnectOptions;
-use url::{Position, Url};
+use url::Url;
 
 /// What stands in for the password wherever the address is shown.
 const HIDDEN: &str = "***";
@@ -65,15 +65,17 @@ impl FromStr for DatabaseUrl {
     type Err = UrlError;
 
     fn from_str(given: &str) -> Result<Self, UrlError> {
-        let mut url = Url::parse(given).map_err(|_| UrlError("it cannot be parsed"))?;
-        if !matches!(url.scheme(), "postgres" | "postgresql") {
+        let (scheme, rest) = given.split_once("://").ok_or(UrlError("it has no scheme"))?;
+        if !matches!(scheme, "postgres" | "postgresql") {
             return Err(UrlError("its scheme is not postgres"));
         }
-        if url[Position::BeforePath..].contains(['@', '#']) {
+        // Before it is parsed: what a password holds would be taken for the port or the path.
+        if rest[rest.find(['/', '?', '#']).unwrap_or(rest.len())..].contains(['@', '#']) {
             return Err(UrlError(
                 "there is a `/`, `?` or `#` before the `@`, or a `#`: write them as %2F, %3F and %23",
             ));
         }
+        let mut url = Url::parse(given).map_err(|_| UrlError("it cannot be parsed"))?;
         if url.query_pairs().any(|(name, _)| !PARAMETERS.contains(&&*name) && !name.starts_with("options[")) {
             return Err(UrlError("it has a parameter that is not known, or a password that is not before the `@`"));
         }
@@ -147,18 +149,22 @@ mod tests {
 
     #[test]
     fn what_is_wrong_is_told_without_what_was_given() {
-        for given in [
-            "hunter2",
-            "mysql://me:hunter2@host/db",
-            "postgres://me:hunter2/@host/db",
-            "postgres://me:1/hunter2@host/db",
-            "postgres://me:hunter2@host:port/db",
-            "postgres://me@host/db?password=hunter2",
-            "postgres://me@host/db?pasword=hunter2",
-            "postgres://me@host/db?sslmode=hunter2",
+        for (given, reason) in [
+            ("hunter2", "no scheme"),
+            ("postgres:hunter2", "no scheme"),
+            ("postgres:me:hunter2/db", "no scheme"),
+            ("mysql://me:hunter2@host/db", "scheme is not postgres"),
+            ("postgres://me:hunter2/@host/db", "%2F"),
+            ("postgres://me:1/hunter2@host/db", "%2F"),
+            ("postgres://me:hunter2?@host/db", "%3F"),
+            ("postgres://me:hunter2@host:port/db", "cannot be parsed"),
+            ("postgres://me@host/db?password=hunter2", "parameter"),
+            ("postgres://me@host/db?hunter2", "parameter"),
+            ("postgres://me@host/db?sslmode=hunter2", "cannot be parsed"),
         ] {
             let error = given.parse::<DatabaseUrl>().expect_err(given).to_string();
             assert!(!error.contains("hunter2") && error.contains("postgres://USER:PASSWORD@HOST"), "{error}");
+            assert!(error.contains(reason), "{given}: {error}");
         }
     }
 }

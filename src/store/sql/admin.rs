@@ -9,24 +9,24 @@ use super::removal::check_etag;
 use super::rows::{self, Transition, locked_job, micros, number, returning_job};
 use super::{Connection, Lock, Statement, webhooks};
 use crate::domain::job::{Job, JobName, JobState};
-use crate::store::record::{Changed, QueueReport, QueueStats, TenantQueue};
+use crate::store::record::{ChangeReply, QueueReport, QueueStats, TenantQueue};
 use crate::store::{Error, Notification, QueueBounds};
 
-/// Puts a job that ended without a result into the queue again; see [`crate::store::Store::retry_job`].
+/// Puts a job that ended without a result into the queue again; see `Store::retry_job`.
 pub(super) async fn retry(
     connection: &mut dyn Connection,
     name: &JobName,
     etag: Option<&str>,
     bounds: &QueueBounds,
     now: SystemTime,
-) -> Result<Changed, Error> {
+) -> Result<ChangeReply, Error> {
     // Before the job's row, as whoever creates jobs takes them: two in the other order would wait for each other.
     connection.take_lock(Lock::Admission).await?;
     let job = locked_job(connection, name).await?;
     check_etag(connection, name, etag).await?;
     match job.state {
         JobState::Queued | JobState::Running => {
-            return Ok(Changed { job: jobs::get(connection, name).await?, by_this_call: false });
+            return Ok(ChangeReply { job: jobs::get(connection, name).await?, by_this_call: false });
         }
         JobState::Succeeded => return Err(Error::Succeeded(name.clone())),
         JobState::Failed | JobState::Cancelled | JobState::DeadlineExceeded => {}
@@ -48,7 +48,7 @@ pub(super) async fn retry(
     connection.execute(anew.bind(micros(now)).bind(job.id)).await?;
     webhooks::renew(connection, job.id).await?;
     let job = rows::transition(connection, &job, Transition::to(JobState::Queued), now).await?;
-    Ok(Changed { job, by_this_call: true })
+    Ok(ChangeReply { job, by_this_call: true })
 }
 
 /// Changes the priority of a queued job.

@@ -9,7 +9,7 @@ use super::rows::{
 use super::{Connection, Row, Statement, jobs, removal};
 use crate::domain::job::{AttemptEnd, EventBody, Failure, Job, JobName, JobState, PastAttempt};
 use crate::domain::progress::Progress;
-use crate::store::record::{Changed, Ending, Heartbeat, Lease, Outcome};
+use crate::store::record::{ChangeReply, Ending, Heartbeat, Lease, Outcome};
 use crate::store::{ATTEMPTS_EXHAUSTED, Error, Notification, payload};
 
 /// Attempts that a failure tells of, the latest ones: those given back at a drain do not count against the cap, and
@@ -97,7 +97,7 @@ pub(super) async fn request_cancel(
     name: &JobName,
     etag: Option<&str>,
     now: SystemTime,
-) -> Result<Changed, Error> {
+) -> Result<ChangeReply, Error> {
     let job = locked_job(connection, name).await?;
     removal::check_etag(connection, name, etag).await?;
     let ended_now = job.state == JobState::Queued;
@@ -109,7 +109,7 @@ pub(super) async fn request_cancel(
             .await?;
         connection.notify(Notification::Cancel(name.clone())).await?;
     }
-    Ok(Changed { job: jobs::get(connection, name).await?, by_this_call: ended_now })
+    Ok(ChangeReply { job: jobs::get(connection, name).await?, by_this_call: ended_now })
 }
 
 /// Takes back the leases that ran out at `expired_at`, or all of them.

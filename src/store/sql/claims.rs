@@ -22,7 +22,7 @@ pub(super) async fn may_claim(connection: &mut dyn Connection) -> Result<bool, E
     connection.row(select).await?.flag("found")
 }
 
-/// See [`crate::store::Store::claim`].
+/// See `Store::claim`.
 ///
 /// * `lease_now`: now, on the clock of leases
 pub(super) async fn claim(

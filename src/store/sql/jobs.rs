@@ -8,19 +8,21 @@ use super::{Connection, Lock, Row, Statement, fairness, uploads, webhooks};
 use crate::domain::job::{EventBody, Job, JobEvent, JobName, JobState};
 use crate::domain::{InputName, Webhook};
 use crate::store::query::Paged;
-use crate::store::record::{Changed, EncodedResult, JobInput, JobPayload, NewRecord, QueueStats, Request, TenantQueue};
+use crate::store::record::{
+    ChangeReply, EncodedResult, JobInput, JobPayload, NewRecord, QueueStats, Request, TenantQueue,
+};
 use crate::store::{Error, JobQuery, Notification, Order, Page, QueueBounds, TakenId, payload};
 
 /// Number of a job's first event, which its row counts.
 const FIRST_EVENT: u64 = 1;
 
-/// Stores jobs, all or none; see [`crate::store::Store::create_jobs`].
+/// Stores jobs, all or none; see `Store::create_jobs`.
 pub(super) async fn create(
     connection: &mut dyn Connection,
     news: &[NewRecord],
     bounds: &QueueBounds,
     now: SystemTime,
-) -> Result<Vec<Changed>, Error> {
+) -> Result<Vec<ChangeReply>, Error> {
     check_size(connection, news, bounds).await?;
     let mut stats = AdmissionStats::default();
     let mut inputs = vec![None; news.len()];
@@ -48,7 +50,7 @@ pub(super) async fn create(
                     let delete = Statement::new("DELETE FROM inputs WHERE id = $1 AND input IS NULL");
                     connection.execute(delete.bind(input)).await?;
                 }
-                created.push(Changed {
+                created.push(ChangeReply {
                     job: attach(connection, job, new.cancel_on_disconnect).await?,
                     by_this_call: false,
                 });
@@ -58,7 +60,7 @@ pub(super) async fn create(
                     Some(input) => input,
                     None => input_of(connection, new, now).await?,
                 };
-                created.push(Changed { job: enqueue(connection, new, input, now).await?, by_this_call: true });
+                created.push(ChangeReply { job: enqueue(connection, new, input, now).await?, by_this_call: true });
                 stats.add(new);
                 stored.push(new);
             }
@@ -235,7 +237,7 @@ async fn attach(connection: &mut dyn Connection, job: Job, cancel_on_disconnect:
     rows::job(&row)
 }
 
-/// One of the calls that a job depends on was disconnected; see [`crate::store::Store::detach`].
+/// One of the calls that a job depends on was disconnected; see `Store::detach`.
 pub(super) async fn detach(connection: &mut dyn Connection, name: &JobName, created: SystemTime) -> Result<Job, Error> {
     let update = Statement::new(returning_job!(
         "UPDATE jobs SET detached_calls = detached_calls + 1 \

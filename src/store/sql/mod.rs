@@ -97,6 +97,14 @@ where
     async fn rows(&mut self, statement: Statement) -> Result<Vec<Row>, Error> {
         (**self).rows(statement).await
     }
+
+    async fn take_lock(&mut self, lock: Lock) -> Result<(), Error> {
+        (**self).take_lock(lock).await
+    }
+
+    async fn notify(&mut self, notification: Notification) -> Result<(), Error> {
+        (**self).notify(notification).await
+    }
 }
 
 /// What one transaction at a time may do, where writing is not that by itself.

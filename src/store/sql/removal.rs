@@ -7,7 +7,7 @@ use super::{Connection, Statement, jobs, uploads};
 use crate::domain::job::JobName;
 use crate::store::Error;
 
-/// Removes an ended job; see [`crate::store::Store::delete_job`].
+/// Removes an ended job; see `Store::delete_job`.
 pub(super) async fn delete(connection: &mut dyn Connection, name: &JobName, etag: Option<&str>) -> Result<(), Error> {
     let job = locked_job(connection, name).await?;
     check_etag(connection, name, etag).await?;

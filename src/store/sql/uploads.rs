@@ -74,7 +74,7 @@ async fn held(connection: &mut dyn Connection, lease: &UploadLease) -> Result<Up
     }
 }
 
-/// Begins an upload, or goes on with one; see [`crate::store::Store::begin_upload`].
+/// Begins an upload, or goes on with one; see `Store::begin_upload`.
 pub(super) async fn begin(
     connection: &mut dyn Connection,
     new: &NewUpload,
@@ -281,7 +281,7 @@ pub(super) async fn list(connection: &mut dyn Connection, query: &InputQuery) ->
     rows::page(connection, query, select, "input", stored_input).await
 }
 
-/// Takes an uploaded input's name away; see [`crate::store::Store::delete_input`].
+/// Takes an uploaded input's name away; see `Store::delete_input`.
 pub(super) async fn delete(connection: &mut dyn Connection, name: &InputName) -> Result<(), Error> {
     let select = Statement::new("SELECT id FROM inputs WHERE tenant = $1 AND input = $2")
         .bind(&name.tenant)

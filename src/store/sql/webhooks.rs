@@ -29,7 +29,7 @@ pub(super) async fn renew(connection: &mut dyn Connection, id: i64) -> Result<()
     connection.execute(update(id, &Webhook::pending(webhook.url), None)?).await
 }
 
-/// What is to be sent; see [`crate::store::Store::webhook_queue`].
+/// What is to be sent; see `Store::webhook_queue`.
 pub(super) async fn queue(connection: &mut dyn Connection, due_by: SystemTime) -> Result<WebhookQueue, Error> {
     let select = "SELECT COUNT(*) AS pending, MIN(due_time) AS first_due FROM webhooks WHERE due_time IS NOT NULL";
     let row = connection.row(Statement::new(select)).await?;
@@ -37,7 +37,7 @@ pub(super) async fn queue(connection: &mut dyn Connection, due_by: SystemTime) -
     Ok(WebhookQueue { pending: number(&row, "pending")?, is_due: first_due.is_some_and(|due| due <= micros(due_by)) })
 }
 
-/// Leases what is due until `expires`; see [`crate::store::Store::claim_webhook`].
+/// Leases what is due until `expires`; see `Store::claim_webhook`.
 pub(super) async fn claim(
     connection: &mut dyn Connection,
     passed: &PassedOver,
@@ -60,7 +60,7 @@ pub(super) async fn claim(
     rows::job(&job).map(Some)
 }
 
-/// Notes what an attempt came to; see [`crate::store::Store::settle_webhook`].
+/// Notes what an attempt came to; see `Store::settle_webhook`.
 pub(super) async fn settle(
     connection: &mut dyn Connection,
     claimed: &Job,

@@ -355,3 +355,14 @@ impl Connection for SimulatedConnection {
         Ok(())
     }
 }
+
+mod tests {
+    use super::*;
+    use crate::store::contract::store_contract;
+
+    async fn open() -> Option<Arc<Simulated<true>>> {
+        Some(Arc::new(Cluster::new(None).connect(0, SystemTime::UNIX_EPOCH)))
+    }
+
+    store_contract!(open);
+}

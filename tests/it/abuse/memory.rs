@@ -5,7 +5,7 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use scpsfm::rpc::convert;
-use scpsfm::rpc::convert::set::Set;
+use scpsfm::rpc::convert::input_message::InputMessage;
 use scpsfm::rpc::proto::calibration_service_client::CalibrationServiceClient;
 use scpsfm::rpc::proto::job_service_client::JobServiceClient;
 use scpsfm::rpc::proto::{self, JobState, create_job_request::Source, solve_request::Message};

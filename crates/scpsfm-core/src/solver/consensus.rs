@@ -39,8 +39,8 @@ impl ConsensusOptions {
 options! {
     /// How the noise of a consensus is settled.
     pub struct NoiseOptions {
-        /// Noise that growing starts from when the caller gives none, as a share of the image side. High on purpose: twice
-        /// too low loses the scene, ten times too high costs nothing.
+        /// Noise that growing starts from when the caller gives none, as a share of the image side. High on purpose:
+        /// twice too low loses the scene, ten times too high costs nothing.
         initial: f64 = 0.005,
         /// Rounds of re-estimating it. From ten times too high two or three suffice.
         rounds: usize = 6,

@@ -12,8 +12,7 @@ use nalgebra::Vector2;
 
 use super::block::Block;
 use super::consensus::LEAST_INLIERS;
-use crate::domain::StopToken;
-use crate::domain::VERIFIED;
+use crate::domain::{StopToken, VERIFIED};
 
 options! {
     /// What counts as near-duplicates.

@@ -1,7 +1,6 @@
 //! An input as every stage sees it: normalised, by view and by track, its views in cameras that have a calibration
 //! each.
 
-use super::noise_model;
 use std::collections::BTreeSet;
 
 use nalgebra::Vector2;
@@ -12,7 +11,7 @@ use super::consensus::{LEAST_INLIERS, LEAST_VIEWS, NoiseOptions};
 use super::error::Error;
 use super::known_focal::{KnownFocal, known_focal};
 use super::normalization::normalization;
-use super::{near_duplicates, static_tracks};
+use super::{near_duplicates, noise_model, static_tracks};
 use crate::domain::{FocalPrior, Input, Method, SolveSettings, StopToken, VERIFIED, View, Warning, WarningCode};
 use crate::geometry::bundle::metric::Intrinsics;
 use crate::geometry::measurement::Normalization;

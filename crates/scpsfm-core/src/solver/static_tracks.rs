@@ -9,8 +9,7 @@ use nalgebra::Vector2;
 
 use super::block::Block;
 use super::consensus::LEAST_INLIERS;
-use crate::domain::VERIFIED;
-use crate::domain::{Warning, WarningCode};
+use crate::domain::{VERIFIED, Warning, WarningCode};
 
 options! {
     /// What counts as static.
@@ -58,7 +57,7 @@ pub fn find(ranges: &[usize], xy: &[Vector2<f64>]) -> Vec<bool> {
 
 /// The block without static tracks; `None` where it has none, or too little beside them.
 ///
-/// * `is_static`: whether each track of the input is
+/// * `is_static`: whether each track of the input is static
 pub fn without(is_static: &[bool], block: &Block) -> Option<Block> {
     let moving = moving(is_static, block);
     (moving.len() < block.tracks.len() && moving.len() >= OPTIONS.least_moving).then(|| block.select(&moving))

@@ -15,7 +15,7 @@ const ASKED_OBSERVATIONS: usize = 50_000;
 
 /// A sample of at most `most` tracks of a block, and what the network says of it, where it was asked.
 ///
-/// * `asks_network`: whether it may be
+/// * `asks_network`: whether the network may be asked
 ///
 /// # Errors
 /// [`Error::Stopped`].

@@ -13,9 +13,9 @@ use crate::store::sql::{Operation, WriteIntent};
 
 /// What the writer takes to begin an operation, or its caller to give it up: whichever comes first.
 #[derive(Debug, Default)]
-pub(super) struct Turn(AtomicBool);
+pub(super) struct BeginFlag(AtomicBool);
 
-impl Turn {
+impl BeginFlag {
     /// `false` where the other one has it.
     pub(super) fn take(&self) -> bool {
         !self.0.swap(true, Ordering::AcqRel)
@@ -26,24 +26,24 @@ impl Turn {
 pub(super) struct Pending {
     operation: Operation<WriteConnection, ()>,
     pub(super) intent: WriteIntent,
-    turn: Arc<Turn>,
+    begin: Arc<BeginFlag>,
     reply: oneshot::Sender<Result<(), Error>>,
 }
 
 impl Pending {
-    /// With the turn that its caller may give up, and where its answer comes.
+    /// With the flag by which its caller may give it up, and where its answer comes.
     pub(super) fn new(
         intent: WriteIntent,
         operation: Operation<WriteConnection, ()>,
-    ) -> (Self, Arc<Turn>, oneshot::Receiver<Result<(), Error>>) {
-        let turn = Arc::new(Turn::default());
+    ) -> (Self, Arc<BeginFlag>, oneshot::Receiver<Result<(), Error>>) {
+        let begin = Arc::new(BeginFlag::default());
         let (reply, answer) = oneshot::channel();
-        (Self { operation, intent, turn: turn.clone(), reply }, turn, answer)
+        (Self { operation, intent, begin: begin.clone(), reply }, begin, answer)
     }
 
     /// Marks it as begun; `false` where its caller is gone, and nobody wants it any more.
     pub(super) fn begins(&self) -> bool {
-        self.turn.take() && !self.reply.is_closed()
+        self.begin.take() && !self.reply.is_closed()
     }
 
     /// Whether it is to have a commit of its own.
@@ -75,7 +75,7 @@ mod tests {
     #[test]
     fn of_a_writer_and_a_caller_one_has_the_turn() {
         for round in 0..1_000 {
-            let (turn, both) = (Arc::new(Turn::default()), Arc::new(std::sync::Barrier::new(2)));
+            let (turn, both) = (Arc::new(BeginFlag::default()), Arc::new(std::sync::Barrier::new(2)));
             let begins = thread::spawn({
                 let (turn, both) = (turn.clone(), both.clone());
                 move || {

@@ -22,11 +22,10 @@ use super::problem::Problem;
 use super::projective::ProjectiveReconstruction;
 use super::recorder::Recorder;
 use super::search::rigid::{LEAST_TRACKS, Rigid};
-use super::{all_tracks, near_duplicates, scpsfm, static_tracks, track_sampling};
+use super::{all_tracks, near_duplicates, scpsfm, spread, static_tracks, track_sampling};
 use crate::domain::{FocalPrior, Grade, Method, Stage, WarningCode};
 use crate::geometry::bundle::metric::{Intrinsics, MetricReconstruction};
 use crate::geometry::statistics::median;
-use crate::solver::spread;
 
 const OPTIONS: AttemptOptions = AttemptOptions::DEFAULT;
 

@@ -20,6 +20,7 @@ use crate::geometry::{Camera, Point};
 
 const OPTIONS: GrowingOptions = GrowingOptions::DEFAULT;
 const CONSENSUS: ConsensusOptions = ConsensusOptions::DEFAULT;
+
 /// Fits at one noise level, and where those ended that converged: the same support under the same loss ends there
 /// again, so that it is looked up instead.
 ///

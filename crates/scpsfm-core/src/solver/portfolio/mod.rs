@@ -11,7 +11,6 @@ mod options;
 mod proposals;
 mod stats;
 
-use crate::solver::spread;
 use std::time::Instant;
 
 use rand::SeedableRng;
@@ -23,6 +22,7 @@ use super::recorder::Recorder;
 use super::scpsfm::{HeadOptions, HeadSearch};
 use super::search::rigid::Rigid;
 use super::search::{affine, subspace};
+use super::spread;
 use crate::domain::result::ProposalTime;
 use crate::domain::{Proposal, SolveSettings, StopToken};
 use crate::geometry::measurement::CompleteBlock;

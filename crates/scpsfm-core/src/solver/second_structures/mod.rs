@@ -20,9 +20,8 @@ use super::recorder::Recorder;
 use super::search::affine::AffineSearch;
 use super::sequence::{self, Ended, ExtensionOptions};
 use super::view_selection::ViewSelectionOptions;
-use crate::domain::VERIFIED;
 use crate::domain::second_structure::{SecondStructure, SecondStructureKind};
-use crate::domain::{Method, Silent, SolveSettings, StopToken, Warning, WarningCode};
+use crate::domain::{Method, Silent, SolveSettings, StopToken, VERIFIED, Warning, WarningCode};
 
 options! {
     /// What counts as a second structure, and what is said of its motion.

@@ -1,18 +1,17 @@
 //! What the whole sequence says of the calibration of each camera.
 
-use crate::solver::consensus;
 use nalgebra::Vector3;
 
 use super::adjust::{self, Extract};
 use super::model::Model;
 use super::options::StretchOptions;
 use super::{own_focals, structure, windows};
-use crate::domain::VERIFIED;
-use crate::domain::{FocalPrior, Grade, Task, Warning, WarningCode};
+use crate::domain::{FocalPrior, Grade, Task, VERIFIED, Warning, WarningCode};
 use crate::geometry::bundle::metric::{Intrinsics, MetricReconstruction};
 use crate::geometry::observation::Observation;
 use crate::geometry::{Camera, Point};
 use crate::solver::calibration::{self, Outcome, Uncalibrated};
+use crate::solver::consensus;
 use crate::solver::error::Error;
 use crate::solver::problem::Problem;
 use crate::solver::recorder::Recorder;

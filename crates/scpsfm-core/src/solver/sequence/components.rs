@@ -14,8 +14,7 @@ use crate::solver::consensus;
 use crate::solver::error::Error;
 use crate::solver::problem::Problem;
 use crate::solver::recorder::Recorder;
-use crate::solver::view_selection;
-use crate::solver::view_selection::SeedViews;
+use crate::solver::view_selection::{self, SeedViews};
 
 const OPTIONS: ComponentOptions = ComponentOptions::DEFAULT;
 /// How the block of a further component is searched.

@@ -6,7 +6,6 @@
 //! turning camera looks like a scene with depth. Where that calibrates a part of the scene, the input is searched once
 //! more, behind the lenses that were calibrated.
 
-use crate::solver::noise_model;
 use std::f64::consts::SQRT_2;
 
 use super::{Ended, Extended, QUICK_SEED, QuickPass};
@@ -15,6 +14,7 @@ use crate::geometry::bundle::metric::Intrinsics;
 use crate::geometry::homography;
 use crate::solver::calibration::Outcome;
 use crate::solver::error::Error;
+use crate::solver::noise_model;
 use crate::solver::problem::{Problem, Undone};
 use crate::solver::projective::ProjectiveReconstruction;
 use crate::solver::recorder::Recorder;

@@ -1,10 +1,10 @@
 //! The thresholds of growing, adjusting and calibrating a sequence, with their reasons.
 
-use crate::solver::consensus;
 use std::ops::RangeInclusive;
 
 use crate::geometry::bundle::{Loss, Options};
 use crate::geometry::statistics::CHI_SQUARE_OF_TWO;
+use crate::solver::consensus;
 use crate::solver::view_selection::ViewSelectionOptions;
 
 options! {

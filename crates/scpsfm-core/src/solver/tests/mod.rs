@@ -13,9 +13,9 @@ mod triplets;
 mod two_views;
 
 use super::*;
-use crate::domain::StopReason;
 use crate::domain::{
-    Backend, FocalPrior, Grade, Limits, Method, Progress, Proposal, RawInput, Silent, Stage, Status, View, WarningCode,
+    Backend, FocalPrior, Grade, Limits, Method, Progress, Proposal, RawInput, Silent, Stage, Status, StopReason, View,
+    WarningCode,
 };
 use crate::synthetic::metrics::agreement;
 use crate::synthetic::{Scene, SceneOptions};

@@ -1,4 +1,4 @@
-//! The kinds of inputs, and the arrays of each: one table, by which sets are checked, measured and decoded, cut into
+//! The kinds of inputs, and the arrays of each: one table, by which messages are checked, measured and decoded, cut into
 //! chunks by clients and put together again by servers.
 
 use prost::Message;
@@ -13,7 +13,7 @@ pub const CHUNK_ENTRIES: usize = 65_536;
 /// in the lists of neighbours and of pieces, some 52 bytes for the 8 of two keypoints.
 const JOINING_COPIES: u64 = 3;
 
-/// An array of a set.
+/// An array of an input.
 pub enum Array<'a> {
     Integers(&'a mut Vec<u32>),
     Reals(&'a mut Vec<f64>),
@@ -34,7 +34,7 @@ impl Count {
 }
 
 /// An input in one message, or as a head and chunks.
-pub trait Set: Message + Default {
+pub trait InputMessage: Message + Default {
     type Chunk;
 
     /// Its name in requests and in violations.
@@ -50,11 +50,11 @@ pub trait Set: Message + Default {
     /// Adds what follows.
     fn append(&mut self, chunk: Self::Chunk);
 
-    /// The numbers that it claims, and its views.
-    fn claims(&self, limits: &Limits) -> Vec<Count>;
+    /// The counts that it declares, and its views.
+    fn declared_counts(&self, limits: &Limits) -> impl Iterator<Item = Count>;
 
     /// The lengths of its arrays.
-    fn lengths(&self, limits: &Limits) -> Vec<Count>;
+    fn array_counts(&self, limits: &Limits) -> impl Iterator<Item = Count>;
 
     /// Bytes that it takes in memory; those of matches count as often as joining needs them.
     fn bytes(&self) -> u64;
@@ -67,20 +67,21 @@ pub trait Set: Message + Default {
     /// # Errors
     /// A violation of the first field that is too long.
     fn check_counts(&self, limits: &Limits) -> Result<(), InvalidInput> {
-        within(Self::NAME, self.claims(limits))?;
-        within(Self::NAME, self.lengths(limits))
+        within(Self::NAME, self.declared_counts(limits))?;
+        within(Self::NAME, self.array_counts(limits))
     }
 }
 
-/// Implements [`Set`]. `head` is what is in no chunk, `claims` what is bounded of that, `whole` the array of it.
-macro_rules! sets {
+/// Implements [`InputMessage`]. `head` is what is in no chunk, `declares` what is bounded of that, `head_array` the array
+/// of it.
+macro_rules! input_messages {
     ($($set:ident, $chunk:ident, $name:literal {
         head: $($head:ident),+;
-        claims: $($claim:ident <= $bound:ident),*;
-        whole: $($whole_tag:literal $whole:ident $whole_kind:ident)?;
+        declares: $($claim:ident <= $bound:ident),*;
+        head_array: $($head_tag:literal $head_array:ident $head_kind:ident)?;
         arrays: $($tag:literal $array:ident $kind:ident),+;
     })+) => {$(
-        impl Set for proto::$set {
+        impl InputMessage for proto::$set {
             type Chunk = proto::$chunk;
 
             const NAME: &'static str = $name;
@@ -98,28 +99,30 @@ macro_rules! sets {
                 $(self.$array.append(&mut chunk.$array);)+
             }
 
-            fn claims(&self, limits: &Limits) -> Vec<Count> {
-                vec![
+            fn declared_counts(&self, limits: &Limits) -> impl Iterator<Item = Count> {
+                [
                     $(Count { name: stringify!($claim), count: self.$claim as usize, max: limits.$bound },)*
                     Count { name: "views", count: self.views.len(), max: limits.max_views },
                 ]
+                .into_iter()
             }
 
-            fn lengths(&self, limits: &Limits) -> Vec<Count> {
-                vec![
-                    $(Count::of(stringify!($whole), &self.$whole, limits),)?
+            fn array_counts(&self, limits: &Limits) -> impl Iterator<Item = Count> {
+                [
+                    $(Count::of(stringify!($head_array), &self.$head_array, limits),)?
                     $(Count::of(stringify!($array), &self.$array, limits),)+
                 ]
+                .into_iter()
             }
 
             fn bytes(&self) -> u64 {
-                let whole = 0 $(+ bytes_of(stringify!($whole), &self.$whole))?;
-                whole + bytes_of("views", &self.views) $(+ bytes_of(stringify!($array), &self.$array))+
+                let of_head = 0 $(+ bytes_of(stringify!($head_array), &self.$head_array))?;
+                of_head + bytes_of("views", &self.views) $(+ bytes_of(stringify!($array), &self.$array))+
             }
 
             fn array(&mut self, tag: u32) -> Option<(&'static str, Array<'_>)> {
                 match tag {
-                    $($whole_tag => Some((stringify!($whole), Array::$whole_kind(&mut self.$whole))),)?
+                    $($head_tag => Some((stringify!($head_array), Array::$head_kind(&mut self.$head_array))),)?
                     $($tag => Some((stringify!($array), Array::$kind(&mut self.$array))),)+
                     _ => None,
                 }
@@ -128,24 +131,24 @@ macro_rules! sets {
     )+};
 }
 
-sets! {
+input_messages! {
     TrackSet, TrackSetChunk, "track_set" {
         head: track_count, views;
-        claims: track_count <= max_tracks;
-        whole: ;
+        declares: track_count <= max_tracks;
+        head_array: ;
         arrays: 3 view_indices Integers, 4 track_indices Integers, 5 xs Reals, 6 ys Reals, 7 sigmas_px Reals,
             8 depths Reals;
     }
     MeasurementMatrix, MeasurementMatrixChunk, "measurement_matrix" {
         head: view_count, track_count, has_depths, views;
-        claims: view_count <= max_views, track_count <= max_tracks;
-        whole: ;
+        declares: view_count <= max_views, track_count <= max_tracks;
+        head_array: ;
         arrays: 3 values Reals, 5 visibility Bytes;
     }
     MatchSet, MatchSetChunk, "match_set" {
         head: keypoint_counts, views;
-        claims: ;
-        whole: 2 keypoint_counts Integers;
+        declares: ;
+        head_array: 2 keypoint_counts Integers;
         arrays: 3 xs Reals, 4 ys Reals, 5 first_view_indices Integers, 6 second_view_indices Integers,
             7 match_counts Integers, 8 first_keypoint_indices Integers, 9 second_keypoint_indices Integers;
     }
@@ -173,8 +176,8 @@ fn part<T: Clone>(entries: &[T], number: usize) -> Vec<T> {
 }
 
 /// Refuses the first count that is above its limit.
-pub fn within(prefix: &str, counts: Vec<Count>) -> Result<(), InvalidInput> {
-    match counts.into_iter().find(|Count { count, max, .. }| count > max) {
+pub fn within(prefix: &str, mut counts: impl Iterator<Item = Count>) -> Result<(), InvalidInput> {
+    match counts.find(|Count { count, max, .. }| count > max) {
         Some(Count { name, count, max }) => {
             Err(Violation::of(format!("{prefix}.{name}"), format!("{count} are above the limit of {max}")).into())
         }

@@ -8,15 +8,12 @@ use futures_util::FutureExt;
 
 use super::Size::{Payload, Small};
 use super::WriteIntent::{Begins, Ends, Little};
-use super::{
-    Connection, Database, Operation, Size, WriteIntent, admin, attempts, claims, jobs, operation, removal, uploads,
-    webhooks,
-};
+use super::{Connection, Database, Operation, Size, WriteIntent, admin, attempts, claims, jobs, operation, removal};
 use crate::domain::InputName;
 use crate::domain::job::{Job, JobEvent, JobName};
 use crate::domain::progress::Progress;
 use crate::store::record::{
-    Changed, Claim, Claims, EncodedResult, Ending, Heartbeat, JobInput, JobPayload, Lease, NewRecord, Outcome,
+    ChangeReply, Claim, Claims, EncodedResult, Ending, Heartbeat, JobInput, JobPayload, Lease, NewRecord, Outcome,
     PassedOver, QueueReport, QueueStats, Request, StoreStats, Swept, WebhookOutcome, WebhookQueue,
 };
 use crate::store::upload::{BegunUpload, NewInput, NewUpload, PurgedUploads, StoredInput, UploadLease, UploadStatus};
@@ -105,6 +102,10 @@ macro_rules! writes {
     }};
 }
 
+// After the macros, which they use.
+mod uploads;
+mod webhooks;
+
 /// A store of jobs. Every operation is one transaction: state, event and lease change together or not at all.
 ///
 /// `now` is the caller's clock, so that tests need not wait; times are kept to the microsecond.
@@ -121,7 +122,7 @@ impl dyn Database {
         new: Vec<NewRecord>,
         bounds: &QueueBounds,
         now: SystemTime,
-    ) -> Result<Vec<Changed>, Error> {
+    ) -> Result<Vec<ChangeReply>, Error> {
         let new: Arc<[NewRecord]> = new.into();
         let stored = new.iter().map(|new| match &new.input {
             JobInput::Inline(bytes) => bytes.len() as u64,
@@ -164,7 +165,7 @@ impl dyn Database {
 
     /// Leases the next job in the queue and begins it; nothing where none waits, or the queue is paused. Tenants take
     /// turns, by their weights; within a tenant jobs go by priority, then age. Jobs past their deadline are left to
-    /// [`Self::sweep`].
+    /// `sweep`.
     ///
     /// The claim may also prefetch: it leases the job after it, which stays queued until a later claim begins it. Other
     /// claims pass over a prefetched job until that lease expires, but for those that find no other job. Nothing need
@@ -245,7 +246,12 @@ impl dyn Database {
     ///
     /// # Errors
     /// [`Error::NotFound`], [`Error::EtagMismatch`].
-    pub async fn request_cancel(&self, name: &JobName, etag: Option<&str>, now: SystemTime) -> Result<Changed, Error> {
+    pub async fn request_cancel(
+        &self,
+        name: &JobName,
+        etag: Option<&str>,
+        now: SystemTime,
+    ) -> Result<ChangeReply, Error> {
         let etag = etag.map(str::to_owned);
         writes!(self, "request_cancel", Small, Ends(0), [name, etag], |connection| {
             attempts::request_cancel(connection, &name, etag.as_deref(), now)
@@ -264,7 +270,7 @@ impl dyn Database {
         etag: Option<&str>,
         bounds: &QueueBounds,
         now: SystemTime,
-    ) -> Result<Changed, Error> {
+    ) -> Result<ChangeReply, Error> {
         let etag = etag.map(str::to_owned);
         writes!(self, "retry_job", Small, Begins(0), [name, etag, bounds], |connection| {
             admin::retry(connection, &name, etag.as_deref(), &bounds, now)
@@ -344,7 +350,7 @@ impl dyn Database {
         ))
     }
 
-    /// Takes back leases that ran out, as [`Self::recover`] does, and ends queued jobs that are past their deadline.
+    /// Takes back leases that ran out, as `recover` does, and ends queued jobs that are past their deadline.
     pub async fn sweep(&self, now: SystemTime, max_attempts: u32) -> Result<Swept, Error> {
         let _timer = store_operation("sweep");
         // Before the clocks are compared: see `claim`.
@@ -370,164 +376,9 @@ impl dyn Database {
         reads!(self, "result", Payload, |connection| jobs::result(connection, name))
     }
 
-    /// Begins an upload, or goes on with one: from here on its earlier streams cannot write.
-    ///
-    /// # Errors
-    /// [`Error::AlreadyExists`] where it was begun with another length or hash, [`Error::UploadsFull`],
-    /// [`Error::UploadTooLarge`].
-    pub async fn begin_upload(
-        &self,
-        new: &NewUpload,
-        bounds: &UploadBounds,
-        now: SystemTime,
-    ) -> Result<BegunUpload, Error> {
-        let bounds = *bounds;
-        writes!(self, "begin_upload", Small, Begins(0), [new], |connection| uploads::begin(
-            connection, &new, &bounds, now
-        ))
-    }
-
-    /// Adds bytes to an upload, at its end.
-    ///
-    /// # Errors
-    /// [`Error::UploadTakenOver`], [`Error::UploadNotFound`] where it was given up.
-    pub async fn append_upload(
-        &self,
-        lease: &UploadLease,
-        at_byte: u64,
-        data: &[u8],
-        now: SystemTime,
-    ) -> Result<(), Error> {
-        let data: Arc<[u8]> = data.into();
-        writes!(self, "append_upload", Payload, Begins(data.len() as u64), [lease, data], |connection| {
-            uploads::append(connection, &lease, at_byte, &data, now)
-        })
-    }
-
-    /// Some of an upload's bytes from there on, which must be where a read before it ended; none at the end.
-    ///
-    /// # Errors
-    /// [`Error::UploadTakenOver`].
-    pub async fn read_upload(&self, lease: &UploadLease, at_byte: u64) -> Result<Vec<u8>, Error> {
-        reads!(self, "read_upload", Payload, |connection| uploads::read(connection, lease, at_byte))
-    }
-
-    /// Makes an input of an upload whose bytes are all there.
-    ///
-    /// # Errors
-    /// [`Error::UploadTakenOver`], [`Error::UploadNotFound`] where it was given up.
-    pub async fn finish_upload(
-        &self,
-        lease: &UploadLease,
-        new: &Arc<NewInput>,
-        now: SystemTime,
-    ) -> Result<StoredInput, Error> {
-        let intent = Begins(new.payload.len() as u64);
-        writes!(self, "finish_upload", Payload, intent, [lease, new], |connection| {
-            uploads::finish(connection, &lease, &new, now)
-        })
-    }
-
-    /// Gives an upload up: its id is free again.
-    ///
-    /// # Errors
-    /// [`Error::UploadTakenOver`], [`Error::UploadNotFound`].
-    pub async fn give_up_upload(&self, lease: &UploadLease) -> Result<(), Error> {
-        writes!(self, "give_up_upload", Small, Ends(0), [lease], |connection| uploads::give_up(connection, &lease))
-    }
-
-    /// How far an upload has come.
-    ///
-    /// # Errors
-    /// [`Error::UploadNotFound`].
-    pub async fn upload(&self, name: &InputName) -> Result<UploadStatus, Error> {
-        reads!(self, "upload", Small, |connection| uploads::status(connection, name))
-    }
-
-    /// An uploaded input.
-    ///
-    /// # Errors
-    /// [`Error::InputNotFound`].
-    pub async fn uploaded_input(&self, name: &InputName) -> Result<StoredInput, Error> {
-        reads!(self, "uploaded_input", Small, |connection| uploads::input(connection, name))
-    }
-
-    /// One page of a tenant's uploaded inputs.
-    ///
-    /// # Errors
-    /// [`Error::PageToken`].
-    pub async fn inputs(&self, query: &InputQuery) -> Result<Page<StoredInput>, Error> {
-        reads!(self, "inputs", Small, |connection| uploads::list(connection, query))
-    }
-
-    /// Takes an uploaded input's name away, which is free again at once. Jobs that were created with it keep it; it is
-    /// removed with the last of them, or at once where there is none.
-    ///
-    /// # Errors
-    /// [`Error::InputNotFound`].
-    pub async fn delete_input(&self, name: &InputName) -> Result<(), Error> {
-        writes!(self, "delete_input", Payload, Ends(ANY_BYTES), [name], |connection| uploads::delete(connection, &name))
-    }
-
-    /// Gives up the uploads to which nothing came since `abandoned_by`, and removes some of the bytes of those that
-    /// were given up or finished, and some of the uploaded inputs that no job has and none was created with since
-    /// `unused_since`. `None`: none.
-    pub async fn purge_uploads(
-        &self,
-        abandoned_by: Option<SystemTime>,
-        unused_since: Option<SystemTime>,
-    ) -> Result<PurgedUploads, Error> {
-        let _timer = store_operation("purge_uploads");
-        if !reads!(self, Small, |connection| uploads::needs_purge(connection, abandoned_by, unused_since))? {
-            return Ok(PurgedUploads::default());
-        }
-        writes!(self, Payload, Ends(ANY_BYTES), [], |connection| {
-            uploads::purge(connection, abandoned_by, unused_since)
-        })
-    }
-
     /// What waits and what runs.
     pub async fn queue_stats(&self) -> Result<QueueStats, Error> {
         reads!(self, "load", Small, |connection| jobs::queue_stats(connection))
-    }
-
-    /// What is to be sent to the webhooks of jobs that have ended.
-    pub async fn webhook_queue(&self, now: SystemTime) -> Result<WebhookQueue, Error> {
-        let due_by = self.lease_clock(now);
-        reads!(self, "webhook_queue", Small, |connection| webhooks::queue(connection, due_by))
-    }
-
-    /// Leases the delivery of a job's end that is due, passing over some hosts and tenants, and counts an attempt at
-    /// it: first attempts in the order of the jobs, then what is due the longest. Returns the job as it stands then;
-    /// `None` where nothing is due. A delivery whose lease runs out is due again.
-    pub async fn claim_webhook(
-        &self,
-        passed: &PassedOver,
-        now: SystemTime,
-        lease_for: Duration,
-    ) -> Result<Option<Job>, Error> {
-        let due_by = self.lease_clock(now);
-        writes!(self, "claim_webhook", Small, Begins(0), [passed], |connection| webhooks::claim(
-            connection,
-            &passed,
-            due_by,
-            due_by + lease_for
-        ))
-    }
-
-    /// Notes what the attempt at the delivery of a `claimed` job came to. `false` where the job is gone, or another
-    /// attempt has begun since: nothing is noted then.
-    pub async fn settle_webhook(
-        &self,
-        claimed: &Job,
-        outcome: &WebhookOutcome,
-        now: SystemTime,
-    ) -> Result<bool, Error> {
-        let now = self.lease_clock(now);
-        let claimed = Arc::new(claimed.clone());
-        writes!(self, "settle_webhook", Small, Ends(0), [claimed, outcome], |connection| webhooks::settle(
-            connection, &claimed, &outcome, now
-        ))
     }
 
     /// What operators watch.
