@@ -8,8 +8,9 @@ use super::measures::{Measures, error_3d, true_image_px, true_points};
 use crate::domain::StopToken;
 use crate::geometry::bundle::Options;
 use crate::geometry::bundle::metric::{
-    self, Information, Intrinsics, IntrinsicsModel, IntrinsicsPrior, MetricReconstruction, Parameter, Pose,
+    Information, Intrinsics, IntrinsicsModel, IntrinsicsPrior, MetricReconstruction, Parameter, Pose,
 };
+use crate::geometry::bundle::sequence;
 use crate::geometry::observation::Observation;
 use crate::geometry::statistics::chi_square_gate;
 use crate::geometry::{Camera, triangulation};
@@ -160,7 +161,7 @@ impl<'a> World<'a> {
             relative_tolerance: ADJUSTMENT_TOLERANCE,
             ..Options::default()
         };
-        metric::adjust(
+        sequence::adjust_all(
             &mut found,
             &observations,
             IntrinsicsModel::FOCAL,

@@ -8,7 +8,8 @@ use nalgebra::{Matrix3, Rotation3, Vector2, Vector3};
 use super::bundle::critical::{
     BundleProblem, HOMOGRAPHIES_GAUGE, Homographies, TRANSLATING_GAUGE, Translating, minimise,
 };
-use super::bundle::metric::{self, Intrinsics, IntrinsicsModel, IntrinsicsPrior, MetricReconstruction, Pose};
+use super::bundle::metric::{Intrinsics, IntrinsicsModel, IntrinsicsPrior, MetricReconstruction, Pose};
+use super::bundle::sequence;
 use super::bundle::{Loss, Options};
 use super::daq::scan_focal;
 use super::fundamental::{Fundamental, Match};
@@ -128,8 +129,8 @@ pub fn fit_rotation(
     }
     let simplest = IntrinsicsModel::focal(model.is_per_view());
     let options = Options::squared(ITERATIONS);
-    metric::adjust(&mut rotation, observations, simplest, priors, &options, stop);
-    let report = metric::adjust(&mut rotation, observations, model, priors, &options, stop);
+    sequence::adjust_all(&mut rotation, observations, simplest, priors, &options, stop);
+    let report = sequence::adjust_all(&mut rotation, observations, model, priors, &options, stop);
     let cost = report.cost - IntrinsicsPrior::cost_of(priors, model, &rotation.intrinsics);
     let unknowns = rotation
         .unknowns(observed_points(observations, rotation.points.len()), model.parameters().len() * priors.len());

@@ -215,7 +215,8 @@ pub fn retriangulate(
 
 #[cfg(test)]
 mod tests {
-    use super::super::bundle::metric::{IntrinsicsModel, IntrinsicsPrior, adjust};
+    use super::super::bundle::metric::{IntrinsicsModel, IntrinsicsPrior};
+    use super::super::bundle::sequence::adjust_all;
     use super::super::bundle::{Options, testing};
     use super::super::daq::{refine, scan};
     use super::*;
@@ -272,7 +273,7 @@ mod tests {
             let mut right = scene.reconstruction();
             let (model, priors) = (IntrinsicsModel::FIXED, [IntrinsicsPrior::NONE]);
             let options = Options { relative_tolerance: 1e-14, ..Options::squared(50) };
-            adjust(&mut right, &scene.observations, model, &priors, &options, &StopToken::default());
+            adjust_all(&mut right, &scene.observations, model, &priors, &options, &StopToken::default());
             let mut found = right.clone();
             found.points[1] *= 1e7;
             found.points[2] = -found.points[2];

@@ -14,8 +14,9 @@ use super::search::rigid::{Rigid, RigidSearch};
 use super::spread;
 use crate::domain::{Grade, Warning, WarningCode};
 use crate::geometry::bundle::metric::{
-    self, Information, Intrinsics, IntrinsicsModel, IntrinsicsPrior, MetricReconstruction, Parameter, Pose,
+    Information, Intrinsics, IntrinsicsModel, IntrinsicsPrior, MetricReconstruction, Parameter, Pose,
 };
+use crate::geometry::bundle::sequence;
 use crate::geometry::measurement::CompleteBlock;
 use crate::geometry::observation::Observation;
 use crate::geometry::robust_triangulation::or_zeros;
@@ -101,7 +102,8 @@ pub fn calibrate(problem: &Problem, block: &CompleteBlock, consensus: &Consensus
     }
     let Some(mut found) = start(consensus, &inliers, focal) else { return outcome };
     let options = problem.calibration_options.search.to_convergence();
-    let report = metric::adjust(&mut found, &observations, model, &[IntrinsicsPrior::NONE], &options, problem.stop);
+    let report =
+        sequence::adjust_all(&mut found, &observations, model, &[IntrinsicsPrior::NONE], &options, problem.stop);
     let noise = consensus.noise.max((report.cost / freedom as f64).sqrt());
     let sigma = Information::new(&found, &observations)
         .and_then(|information| {

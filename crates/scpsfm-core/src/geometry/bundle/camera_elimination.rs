@@ -7,7 +7,7 @@
 use nalgebra::{SVector, Vector2};
 
 use super::Observation;
-use super::engine::{BundleProblem, Jacobian, Layout, ResidualVisitor, Step};
+use super::problem::{BundleProblem, Jacobian, Layout, ResidualVisitor, Step};
 
 /// Share of the unknowns of the cameras that those of the points may have at most: with as many of either, a camera's
 /// larger blocks cost more to eliminate.

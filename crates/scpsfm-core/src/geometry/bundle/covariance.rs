@@ -4,7 +4,8 @@ use nalgebra::{DMatrix, DVector};
 
 use super::Observation;
 use super::intrinsics::Intrinsics;
-use super::intrinsics_model::{IntrinsicsModel, IntrinsicsPrior, Parameter};
+use super::intrinsics::Parameter;
+use super::intrinsics_model::{IntrinsicsModel, IntrinsicsPrior};
 use super::metric::MetricReconstruction;
 use super::own_focals::Function;
 use super::sequence::System;
@@ -161,7 +162,8 @@ mod tests {
     use nalgebra::{Vector2, Vector3};
 
     use super::super::Options;
-    use super::super::metric::{Extension, adjust};
+    use super::super::metric::Extension;
+    use super::super::sequence::adjust_all;
     use super::super::testing::{self, Motion, NOISE, TestScene};
     use super::*;
     use crate::domain::StopToken;
@@ -309,7 +311,7 @@ mod tests {
                 let options = Options { max_iterations: 100, relative_tolerance: 1e-13, ..Options::default() };
                 let stop = StopToken::default();
                 let report =
-                    adjust(&mut start, &scene.observations, model, std::slice::from_ref(prior), &options, &stop);
+                    adjust_all(&mut start, &scene.observations, model, std::slice::from_ref(prior), &options, &stop);
                 (start, report.cost)
             };
             let prior = IntrinsicsPrior::NONE.knowing(Parameter::PrincipalX, 0.001, 0.01, 0.0005);
@@ -368,7 +370,7 @@ mod tests {
             let adjusted = |mut start: MetricReconstruction, model: IntrinsicsModel| {
                 let options = Options { max_iterations: 100, relative_tolerance: 1e-13, ..Options::default() };
                 let priors = [IntrinsicsPrior::NONE; 2];
-                adjust(&mut start, &scene.observations, model, &priors, &options, &StopToken::default());
+                adjust_all(&mut start, &scene.observations, model, &priors, &options, &StopToken::default());
                 start
             };
             let simple =

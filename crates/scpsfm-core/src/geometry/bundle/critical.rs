@@ -7,8 +7,9 @@
 use nalgebra::{Matrix3, SMatrix, SVector, Vector2, Vector3};
 
 use super::Observation;
-pub(crate) use super::engine::{BundleProblem, minimise};
-use super::engine::{Jacobian, ResidualVisitor, Step, image, move_each, unit_norm};
+pub(crate) use super::engine::minimise;
+pub(crate) use super::problem::BundleProblem;
+use super::problem::{Jacobian, ResidualVisitor, Step, image, move_each, unit_norm};
 
 /// Views of a plane, or of anything from one centre: `x ~ H (x, y, 1)`.
 #[derive(Debug, Clone)]

@@ -4,7 +4,6 @@ use std::f64::consts::FRAC_PI_2;
 
 use nalgebra::{Matrix3, Vector2, Vector3};
 
-use super::intrinsics_model::Parameter;
 use crate::domain::LensProjection;
 use crate::geometry::observation::Observation;
 
@@ -24,6 +23,36 @@ const WIDEST_DOUBLINGS: usize = 64;
 /// Squared radius below which a fisheye's angle and scale are replaced by their series: above it the difference that is
 /// the scale's slope keeps ten digits, below it the next terms are under rounding in what they are multiplied with.
 const NEAR_AXIS: f64 = 1e-6;
+
+/// An intrinsic as it is adjusted.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Parameter {
+    LogFocal,
+    PrincipalX,
+    PrincipalY,
+    LogAspect,
+    RadialK1,
+    RadialK2,
+    RadialK3,
+    TangentialP1,
+    TangentialP2,
+}
+
+impl Parameter {
+    pub const COUNT: usize = 9;
+    /// In the order of their discriminants.
+    pub const ALL: [Parameter; Self::COUNT] = [
+        Self::LogFocal,
+        Self::PrincipalX,
+        Self::PrincipalY,
+        Self::LogAspect,
+        Self::RadialK1,
+        Self::RadialK2,
+        Self::RadialK3,
+        Self::TangentialP1,
+        Self::TangentialP2,
+    ];
+}
 
 /// Intrinsics in normalised image units, without skew, behind a lens that distorts.
 ///

@@ -1,36 +1,6 @@
 //! Which intrinsics an adjustment frees, and what is known of them beforehand.
 
-use super::intrinsics::Intrinsics;
-
-/// An intrinsic as it is adjusted.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum Parameter {
-    LogFocal,
-    PrincipalX,
-    PrincipalY,
-    LogAspect,
-    RadialK1,
-    RadialK2,
-    RadialK3,
-    TangentialP1,
-    TangentialP2,
-}
-
-impl Parameter {
-    pub const COUNT: usize = 9;
-    /// In the order of their discriminants.
-    pub const ALL: [Parameter; Self::COUNT] = [
-        Self::LogFocal,
-        Self::PrincipalX,
-        Self::PrincipalY,
-        Self::LogAspect,
-        Self::RadialK1,
-        Self::RadialK2,
-        Self::RadialK3,
-        Self::TangentialP1,
-        Self::TangentialP2,
-    ];
-}
+use super::intrinsics::{Intrinsics, Parameter};
 
 /// What may be freed beside the focal length.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]

@@ -3,12 +3,10 @@
 
 use nalgebra::{Matrix3, Matrix3x4, Rotation3, Vector2, Vector3};
 
+use super::Observation;
 pub use super::covariance::{Information, Optimum};
-pub use super::intrinsics::Intrinsics;
-pub use super::intrinsics_model::{Extension, IntrinsicsModel, IntrinsicsPrior, Parameter};
-use super::{Observation, Options, Report, sequence};
-use crate::domain::StopToken;
-use crate::parallel::Threads;
+pub use super::intrinsics::{Intrinsics, Parameter};
+pub use super::intrinsics_model::{Extension, IntrinsicsModel, IntrinsicsPrior};
 
 /// Unknowns of a pose (rotation vector, then translation), of a view with a focal length of its own, whose logarithm
 /// comes after its pose, and of a point.
@@ -222,37 +220,20 @@ impl MetricReconstruction {
     }
 }
 
-/// Minimises the reprojection error over poses, points and the free intrinsics, the same of every camera group, of
-/// which `priors`, one a group, know something. Focal lengths a view are free only where the reconstruction has them.
-///
-/// The cost contains what the priors add.
-///
-/// # Pitfall
-/// Points may pass behind a camera on the way: residuals know no cheirality, so check it on the result.
-pub fn adjust(
-    reconstruction: &mut MetricReconstruction,
-    observations: &[Observation],
-    model: IntrinsicsModel,
-    priors: &[IntrinsicsPrior],
-    options: &Options,
-    stop: &StopToken,
-) -> Report {
-    let models = vec![model; reconstruction.intrinsics.len()];
-    let run = sequence::Run { threads: Threads::ONE, stop, heartbeat: &mut || () };
-    sequence::adjust(reconstruction, observations, &sequence::Free::all(&models), priors, options, run)
-}
-
 #[cfg(test)]
 mod tests {
+    use super::super::Options;
+    use super::super::sequence::adjust_all;
     use super::super::testing::{self, NOISE};
     use super::*;
+    use crate::domain::StopToken;
 
     #[test]
     fn converges_from_a_perturbed_start_to_the_noise_floor() {
         for seed in 0..5 {
             let scene = testing::scene(seed, 8, 30, NOISE);
             let mut start = testing::perturbed(&scene.reconstruction(), 0.02, seed);
-            let report = adjust(
+            let report = adjust_all(
                 &mut start,
                 &scene.observations,
                 IntrinsicsModel::FOCAL,
@@ -294,7 +275,7 @@ mod tests {
             }
             let options = Options { max_iterations: 60, relative_tolerance: 1e-12, ..Options::default() };
             let (model, priors) = (IntrinsicsModel::FOCAL, [IntrinsicsPrior::NONE]);
-            adjust(&mut start, &observations, model, &priors, &options, &StopToken::default());
+            adjust_all(&mut start, &observations, model, &priors, &options, &StopToken::default());
             for (k, point) in start.points.iter().enumerate() {
                 assert!((point.norm() - 1.0).abs() < 0.05, "seed {seed}, point {k}: {point}");
             }
@@ -308,7 +289,7 @@ mod tests {
         let adjusted = |prior: &IntrinsicsPrior| {
             let mut start = scene.reconstruction();
             let options = Options { max_iterations: 60, relative_tolerance: 1e-12, ..Options::default() };
-            let report = adjust(
+            let report = adjust_all(
                 &mut start,
                 &scene.observations,
                 IntrinsicsModel::FOCAL,
@@ -341,7 +322,7 @@ mod tests {
         let before = start.intrinsics.clone();
         let options = Options::default();
         let (model, prior) = (IntrinsicsModel::FIXED, IntrinsicsPrior::NONE);
-        let report = adjust(&mut start, &scene.observations, model, &[prior], &options, &StopToken::default());
+        let report = adjust_all(&mut start, &scene.observations, model, &[prior], &options, &StopToken::default());
         assert!(report.iterations > 0);
         assert_eq!(start.intrinsics, before);
     }
@@ -353,7 +334,7 @@ mod tests {
             let options = Options::default();
             for model in [IntrinsicsModel::FIXED, IntrinsicsModel::FOCAL, IntrinsicsModel::FULL] {
                 let prior = IntrinsicsPrior::NONE;
-                let report = adjust(&mut start, observations, model, &[prior], &options, &StopToken::default());
+                let report = adjust_all(&mut start, observations, model, &[prior], &options, &StopToken::default());
                 assert!(report.cost.is_finite() && report.cost <= report.initial_cost, "{report:?}");
                 if let Some(information) = Information::new(&start, observations) {
                     information.optimum(model, &[prior]);

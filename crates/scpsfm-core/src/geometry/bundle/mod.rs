@@ -18,6 +18,7 @@ mod intrinsics_model;
 pub mod metric;
 mod own_focals;
 mod panel;
+mod problem;
 pub mod projective;
 mod reduced;
 pub mod sequence;

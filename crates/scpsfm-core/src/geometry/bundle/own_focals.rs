@@ -2,7 +2,7 @@
 
 use nalgebra::{DVector, DVectorView, SVector};
 
-use super::intrinsics_model::Parameter;
+use super::intrinsics::Parameter;
 use super::metric::POSE;
 use super::whitened::WhitenedViews;
 

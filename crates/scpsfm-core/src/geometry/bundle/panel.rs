@@ -6,7 +6,7 @@ use faer::{Accum, MatMut, MatRef, Par};
 use nalgebra::SMatrix;
 
 use super::Observation;
-use super::engine::{Jacobian, Layout};
+use super::problem::{Jacobian, Layout};
 
 /// Share of all pairs of point and camera that must be observed for the points to be eliminated by panels, which
 /// calculate with zeros for the others: a product of panels takes a quarter of the time of its pairs or less, whose

@@ -2,7 +2,9 @@
 
 use nalgebra::{Matrix3x4, SVector, Vector4};
 
-use super::engine::{BundleProblem, Jacobian, ResidualVisitor, Step, image, minimise, move_each, unit_norm};
+use super::engine::minimise;
+
+use super::problem::{BundleProblem, Jacobian, ResidualVisitor, Step, image, move_each, unit_norm};
 use super::{Observation, Options, Report};
 use crate::domain::StopToken;
 

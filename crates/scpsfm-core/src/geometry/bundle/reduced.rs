@@ -8,8 +8,8 @@
 use nalgebra::{Cholesky, Matrix2, SMatrix, SVector, Vector2};
 
 use super::cholesky::CholeskySolver;
-use super::engine::{BundleProblem, Jacobian, Layout, ResidualVisitor, Step, usable_squared_norm};
 use super::panel::Panel;
+use super::problem::{BundleProblem, Jacobian, Layout, ResidualVisitor, Step, usable_squared_norm};
 use super::{Loss, Observation};
 use crate::simd::vectorised;
 

@@ -5,8 +5,8 @@ use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 
 use super::Observation;
-use super::engine::{BundleProblem, Jacobian, ResidualVisitor, Step};
 use super::metric::{Intrinsics, MetricReconstruction, Pose};
+use super::problem::{BundleProblem, Jacobian, ResidualVisitor, Step};
 use crate::synthetic::{Scene, SceneOptions};
 
 /// Noise of the tests, one standard deviation as a share of the image: the paper's .3 %.

@@ -5,7 +5,7 @@ use faer::sparse::{SparseColMat, Triplet};
 use faer::{Mat, Side};
 use nalgebra::{DMatrix, DVector, DVectorView};
 
-use super::intrinsics_model::Parameter;
+use super::intrinsics::Parameter;
 use super::metric::{MetricReconstruction, POSE, Pose, VIEW};
 use super::own_focals::{Direction, OwnFocals};
 use super::sequence::{GAUGE_DAMPING, System};

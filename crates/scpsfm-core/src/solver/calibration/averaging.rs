@@ -2,9 +2,8 @@
 
 use super::models::{Candidate, Choice, Selection};
 use crate::geometry::bundle::Options;
-use crate::geometry::bundle::metric::{
-    self, Extension, Intrinsics, IntrinsicsModel, IntrinsicsPrior, Optimum, Parameter,
-};
+use crate::geometry::bundle::metric::{Extension, Intrinsics, IntrinsicsModel, IntrinsicsPrior, Optimum, Parameter};
+use crate::geometry::bundle::sequence;
 
 /// A model as the observations and what lenses are like weigh it.
 struct Weighed<'a> {
@@ -138,7 +137,7 @@ impl Choice<'_> {
             moved.scale_focals(shift.exp());
             let options = Options::squared(options.profile_iterations);
             let report =
-                metric::adjust(&mut moved, self.problem.observations, model, &best.priors, &options, self.stop);
+                sequence::adjust_all(&mut moved, self.problem.observations, model, &best.priors, &options, self.stop);
             let of_group = |(prior, intrinsics): (&IntrinsicsPrior, &Intrinsics)| {
                 let deviation = prior.deviation(Parameter::LogFocal, intrinsics);
                 prior.information[Parameter::LogFocal as usize] * deviation.powi(2)
@@ -202,7 +201,7 @@ mod tests {
                     moved.scale_focals(shift.exp());
                     let options = Options { max_iterations: 5000, relative_tolerance: 1e-13, ..Options::default() };
                     let model = model.without_focal();
-                    let report = metric::adjust(&mut moved, &scene.observations, model, &priors, &options, &stop);
+                    let report = sequence::adjust_all(&mut moved, &scene.observations, model, &priors, &options, &stop);
                     longest = longest.max(report.iterations);
                     (report.cost - best.minimum.cost) / best.fit.noise.powi(2)
                 };

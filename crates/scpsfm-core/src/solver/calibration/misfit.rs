@@ -7,7 +7,8 @@ use super::fit::Fit;
 use super::models::{Candidate, Choice};
 use super::options::FitOptions;
 use crate::domain::StopToken;
-use crate::geometry::bundle::metric::{self, Extension, Intrinsics, IntrinsicsPrior, MetricReconstruction};
+use crate::geometry::bundle::metric::{Extension, Intrinsics, IntrinsicsPrior, MetricReconstruction};
+use crate::geometry::bundle::sequence;
 use crate::geometry::bundle::{Options, projective};
 use crate::geometry::observation::Observation;
 use crate::geometry::{Camera, Point, critical};
@@ -97,7 +98,7 @@ fn undistorted_fits(best: &Candidate, choice: &Choice) -> Option<(Fit, Fit)> {
     };
 
     let model = best.model.without_lens();
-    let report = metric::adjust(&mut pinhole, &observations, model, &best.priors, &options, choice.stop);
+    let report = sequence::adjust_all(&mut pinhole, &observations, model, &best.priors, &options, choice.stop);
     let of_priors = IntrinsicsPrior::cost_of(&best.priors, model, &pinhole.intrinsics);
     Some((projective, Fit::metric(report.cost - of_priors, &pinhole, best.model, problem)))
 }

@@ -8,8 +8,9 @@ use super::options::{CalibrationOptions, SearchOptions};
 use crate::domain::StopToken;
 use crate::geometry::bundle::critical::Translating;
 use crate::geometry::bundle::metric::{
-    self, Information, Intrinsics, IntrinsicsModel, IntrinsicsPrior, MetricReconstruction,
+    Information, Intrinsics, IntrinsicsModel, IntrinsicsPrior, MetricReconstruction,
 };
+use crate::geometry::bundle::sequence;
 use crate::geometry::bundle::{Options, Report};
 use crate::geometry::daq::{self, CanonicalFrame, Daq, Free};
 use crate::geometry::metric::{cheirality, retriangulate, upgrade, upgrade_translation};
@@ -167,7 +168,7 @@ impl Search<'_> {
 
     fn run(&self, options: &Options, start: MetricReconstruction, model: IntrinsicsModel) -> (Minimum, Report) {
         let (mut reconstruction, observations) = (start, self.problem.observations);
-        let report = metric::adjust(&mut reconstruction, observations, model, self.priors, options, self.stop);
+        let report = sequence::adjust_all(&mut reconstruction, observations, model, self.priors, options, self.stop);
         let cheirality = cheirality(&reconstruction, observations);
         (Minimum { reconstruction, cost: report.cost, cheirality }, report)
     }

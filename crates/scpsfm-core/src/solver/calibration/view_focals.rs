@@ -8,7 +8,8 @@ use super::options::{GradeOptions, LensOptions};
 use super::verdict::Verdict;
 use super::{Uncalibrated, ViewFocal};
 use crate::domain::{Grade, WarningCode};
-use crate::geometry::bundle::metric::{self, Extension, IntrinsicsModel, MetricReconstruction};
+use crate::geometry::bundle::metric::{Extension, IntrinsicsModel, MetricReconstruction};
+use crate::geometry::bundle::sequence;
 use crate::geometry::statistics::{median, root_mean_square};
 
 /// The focal length of each view, undetermined where it is.
@@ -84,8 +85,14 @@ pub(super) fn differing(metric: &MetricReconstruction, own: &Fit, choice: &Choic
     let priors = vec![options.lenses.prior(own.noise, None, choice.scale_px); problem.groups()];
     let model = IntrinsicsModel::FOCAL_PER_VIEW.with(Extension::PrincipalPoint).with(Extension::RadialK1);
     let mut freed = metric.clone().with_own_focals();
-    let report =
-        metric::adjust(&mut freed, problem.observations, model, &priors, &options.search.to_convergence(), choice.stop);
+    let report = sequence::adjust_all(
+        &mut freed,
+        problem.observations,
+        model,
+        &priors,
+        &options.search.to_convergence(),
+        choice.stop,
+    );
     if !Fit::metric(report.cost, &freed, model, problem).refutes(own, &options.fit) {
         return None;
     }

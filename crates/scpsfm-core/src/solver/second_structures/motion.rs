@@ -8,7 +8,8 @@ use super::{OPTIONS, Structure};
 use crate::domain::Grade;
 use crate::domain::second_structure::{SecondStructure, SecondStructureKind, StructurePoint, StructurePose};
 use crate::geometry::Camera;
-use crate::geometry::bundle::metric::{self, Intrinsics, IntrinsicsModel, IntrinsicsPrior, MetricReconstruction, Pose};
+use crate::geometry::bundle::metric::{Intrinsics, IntrinsicsModel, IntrinsicsPrior, MetricReconstruction, Pose};
+use crate::geometry::bundle::sequence;
 use crate::geometry::bundle::{Loss, Options};
 use crate::geometry::metric::{cheirality, upgrade_calibrated};
 use crate::geometry::observation::Observation;
@@ -102,7 +103,7 @@ fn calibrated(
         // A wrong track may fit projective cameras that bend to it.
         let loss = Loss::Cauchy { scale: GrowthOptions::METRIC.cauchy_scale * of_scene };
         let options = Options { max_iterations: OPTIONS.iterations, loss, ..Options::default() };
-        let report = metric::adjust(&mut metric, &observations, model, &priors, &options, problem.stop);
+        let report = sequence::adjust_all(&mut metric, &observations, model, &priors, &options, problem.stop);
         (metric, report.cost)
     };
     let (views, planes) = (OPTIONS.plane_views, OPTIONS.planes);

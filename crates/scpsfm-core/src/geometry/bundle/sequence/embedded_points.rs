@@ -9,8 +9,8 @@ use nalgebra::Vector3;
 
 use super::super::Loss;
 use super::MetricReconstruction;
+use super::cost::cost_of_point;
 use super::layout::Seen;
-use super::minimise::cost_of_point;
 use super::normal::Weighted;
 use super::point::PointBlock;
 use super::worker_pool::WorkerPool;

@@ -4,7 +4,7 @@ use std::ops::Range;
 
 use nalgebra::Vector2;
 
-use super::super::intrinsics_model::Parameter;
+use super::super::intrinsics::Parameter;
 use super::super::metric::{POINT, POSE, VIEW};
 use super::grouped::Grouped;
 use super::{CancellationCheck, Free, MetricReconstruction, Observation, holds};

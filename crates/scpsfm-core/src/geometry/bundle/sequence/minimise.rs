@@ -1,19 +1,19 @@
 //! Levenberg-Marquardt over a sequence.
 
-use nalgebra::Vector3;
-
-use super::super::engine::{UNDEFINED_SQUARED, usable_squared_norm};
-use super::super::metric::{IntrinsicsPrior, POSE};
+use super::super::metric::{IntrinsicsModel, IntrinsicsPrior, POSE};
 use super::super::{Loss, Options, Report};
+use super::cost::cost;
 use super::embedded_points::iterate_points;
-use super::layout::{Layout, Seen};
+use super::layout::Layout;
 use super::normal::Normal;
 use super::pattern::Pattern;
 use super::reduced::{Reduced, substitute};
 use super::solver::Solver;
 use super::worker_pool::WorkerPool;
 use super::{CancellationCheck, Free, MetricReconstruction, Observation, Run};
+use crate::domain::StopToken;
 use crate::geometry::levenberg_marquardt::{self, LeastSquares, StepCost};
+use crate::parallel::Threads;
 
 /// Least damping, as a share of the diagonal. Lower than for a block: the weakest directions of a long chain of views
 /// would hardly move at a block's. Where rounding takes the system's definiteness, the attempt fails and is repeated
@@ -67,29 +67,23 @@ pub fn adjust(
     report
 }
 
-/// Sum of the loss over the observations and of what the priors add; `None` when it was stopped.
-fn cost(sequence: &MetricReconstruction, priors: &[IntrinsicsPrior], loss: Loss, pool: &WorkerPool) -> Option<f64> {
-    let layout = pool.layout;
-    let groups = priors.iter().zip(&layout.unknowns.parameters).zip(&sequence.intrinsics);
-    let of_priors: f64 = groups.map(|((prior, parameters), intrinsics)| prior.cost(parameters, intrinsics)).sum();
-    let of_point = |point: usize| Some(cost_of_point(sequence, layout.seen(point), &sequence.points[point], loss));
-    Some(pool.of_points(of_point)?.into_iter().fold(of_priors, |sum, cost| sum + cost))
-}
-
-/// Sum of the loss over the observations of one point, were it at this position.
-pub(super) fn cost_of_point(
-    sequence: &MetricReconstruction,
-    seen: &[Seen],
-    position: &Vector3<f64>,
-    loss: Loss,
-) -> f64 {
-    let mut sum = 0.0;
-    for seen in seen {
-        let at = sequence.poses[seen.view].apply(position);
-        let residual = sequence.intrinsics_of(seen.view).project(&at) - seen.xy;
-        sum += loss.cost(seen.weight * usable_squared_norm(&residual).unwrap_or(UNDEFINED_SQUARED));
-    }
-    sum
+/// The same over all poses, points and the free intrinsics, the same of every camera group, on the caller's thread. Focal lengths a view are free only where the reconstruction has them.
+///
+/// The cost contains what the priors add.
+///
+/// # Pitfall
+/// Points may pass behind a camera on the way: residuals know no cheirality, so check it on the result.
+pub fn adjust_all(
+    reconstruction: &mut MetricReconstruction,
+    observations: &[Observation],
+    model: IntrinsicsModel,
+    priors: &[IntrinsicsPrior],
+    options: &Options,
+    stop: &StopToken,
+) -> Report {
+    let models = vec![model; reconstruction.intrinsics.len()];
+    let run = Run { threads: Threads::ONE, stop, heartbeat: &mut || () };
+    adjust(reconstruction, observations, &Free::all(&models), priors, options, run)
 }
 
 /// What the steps need from one to the next.

@@ -6,6 +6,7 @@
 //! are eliminated many at a time. May depend on nothing of `geometry` but `bundle` and `levenberg_marquardt`, and on
 //! linear algebra.
 
+mod cost;
 mod embedded_points;
 mod grouped;
 mod layout;
@@ -20,7 +21,7 @@ mod system;
 mod tests;
 mod worker_pool;
 
-pub use self::minimise::adjust;
+pub use self::minimise::{adjust, adjust_all};
 pub(super) use self::reduced::GAUGE_DAMPING;
 pub use self::system::System;
 use super::Observation;

@@ -6,8 +6,8 @@ use std::ops::Range;
 use nalgebra::Vector3;
 
 use super::super::Loss;
-use super::super::engine::usable_squared_norm;
 use super::super::metric::{IntrinsicsPrior, POSE, Parameter, Projection, ProjectionGradients, VIEW};
+use super::super::problem::usable_squared_norm;
 use super::MetricReconstruction;
 use super::grouped::Grouped;
 use super::layout::{Layout, Seen};
