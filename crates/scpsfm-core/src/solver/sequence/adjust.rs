@@ -1,8 +1,7 @@
 //! Bundle adjustment of a sequence: of what stands, with the calibration free.
 
-use super::components::FIRST;
 use super::growth;
-use super::model::{Lens, Model};
+use super::model::{FIRST, Lens, Model};
 use super::options::{AdjustmentOptions, GrowthOptions};
 use crate::geometry::bundle::metric::{IntrinsicsModel, IntrinsicsPrior, MetricReconstruction};
 use crate::geometry::bundle::sequence::{self, Free, Run};

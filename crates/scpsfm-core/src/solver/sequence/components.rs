@@ -2,7 +2,7 @@
 //! calibration.
 
 use super::growth::Trial;
-use super::model::{Lens, Model};
+use super::model::{FIRST, Lens, Model};
 use super::options::{ComponentOptions, GrowthOptions};
 use super::triplets::Pairs;
 use super::{merging, register, structure};
@@ -19,8 +19,6 @@ use crate::solver::view_selection::{self, SeedViews};
 const OPTIONS: ComponentOptions = ComponentOptions::DEFAULT;
 /// How the block of a further component is searched.
 const SEED: Effort = Effort { is_seed: true, is_quick: false };
-/// The component that the calibration comes from.
-pub const FIRST: u32 = 0;
 
 /// The model that a block begins.
 pub fn first(problem: &Problem, seed: &Attempt, recorder: &mut Recorder) -> Model {

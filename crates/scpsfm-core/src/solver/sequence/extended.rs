@@ -1,6 +1,6 @@
 //! A block extended metrically to every view that can be registered, and what that is worth.
 
-use super::model::Model;
+use super::model::{FIRST, Model};
 use super::options::{ExtensionOptions, GrowthOptions};
 use super::register;
 use super::{adjust, calibrate, components, growth, structure};
@@ -34,7 +34,7 @@ pub fn extend(problem: &Problem, seed: Attempt, recorder: &mut Recorder) -> Resu
     recorder.enter(Stage::Extend);
     let mut model = components::first(problem, &seed, recorder);
     let mut trials = vec![growth::Trial::default(); problem.views()];
-    register::join(problem, &mut model, components::FIRST, &mut trials, recorder)?;
+    register::join(problem, &mut model, FIRST, &mut trials, recorder)?;
     components::others(problem, &mut model, &seed, &mut trials, recorder)?;
     components::join_rest(problem, &mut model, &mut trials, recorder)?;
     recorder.end_components();
@@ -46,7 +46,7 @@ pub fn extend(problem: &Problem, seed: Attempt, recorder: &mut Recorder) -> Resu
         recorder.step(Task::Adjust, round + 1, rounds, within);
         adjust::all(problem, &mut model, recorder);
         structure::triangulate(problem, &mut model, recorder);
-        for component in 0..=model.component_of.iter().copied().max().unwrap_or(components::FIRST) {
+        for component in 0..=model.component_of.iter().copied().max().unwrap_or(FIRST) {
             let dropped = components::drop_unsupported(problem, &mut model, component, &options, recorder);
             // After the last round nothing would check the views that join.
             if !dropped.is_empty() && round + 1 < rounds {

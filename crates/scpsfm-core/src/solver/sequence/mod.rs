@@ -13,6 +13,7 @@
 
 mod adjust;
 mod calibrate;
+mod calibrated_views;
 mod components;
 mod extended;
 mod growth;

@@ -10,6 +10,9 @@ use crate::geometry::similarity::Similarity;
 use crate::solver::calibration::ViewFocal;
 use crate::solver::problem::Problem;
 
+/// The component that the calibration comes from.
+pub const FIRST: u32 = 0;
+
 /// A point of the reconstruction.
 #[derive(Debug, Clone, Copy)]
 pub struct Landmark {

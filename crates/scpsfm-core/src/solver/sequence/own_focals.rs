@@ -4,7 +4,7 @@
 //! whose focal length nothing determines have none, rather than that of the rest.
 
 use super::adjust::{self, Extract};
-use super::calibrate::{self, too_few};
+use super::calibrated_views::{self, too_few};
 use super::model::Model;
 use super::options::StretchOptions;
 use super::{structure, windows};
@@ -27,8 +27,8 @@ pub fn calibrate(problem: &Problem, model: &mut Model, recorder: &mut Recorder) 
     let registered = model.registered();
     let runs = runs(model);
     let of_run = |k: usize, heartbeat: &mut dyn FnMut()| {
-        let extract = calibrate::core(problem, model, runs.get(k)?, calibrate::of_view(&runs[k]));
-        let found = calibrate::of_extract(problem, &extract, None, model.noise, heartbeat).ok()?;
+        let extract = calibrated_views::core(problem, model, runs.get(k)?, calibrated_views::of_view(&runs[k]));
+        let found = calibrated_views::of_extract(problem, &extract, None, model.noise, heartbeat).ok()?;
         found.into_iter().next().map(|(_, outcome)| (extract, outcome))
     };
     let found = if runs.len() == 1 {
@@ -43,11 +43,11 @@ pub fn calibrate(problem: &Problem, model: &mut Model, recorder: &mut Recorder) 
     // The lens that all runs share is that of the one that knows its focal lengths best.
     let sigma = |outcome: &Outcome| outcome.sigma_log_focal.unwrap_or(f64::INFINITY);
     if let Some((extract, outcome)) = found.iter_mut().min_by(|a, b| sigma(&a.1).total_cmp(&sigma(&b.1))) {
-        calibrate::take_over(model, extract, &[(CAMERA, outcome.clone())]);
+        calibrated_views::take_over(model, extract, &[(CAMERA, outcome.clone())]);
     }
     structure::triangulate(problem, model, recorder);
     adjust::all(problem, model, recorder);
-    calibrate::report_found(problem, model, recorder);
+    calibrated_views::report_found(problem, model, recorder);
     let mut outcome = match found.is_empty() {
         true => too_few(registered.len()),
         false => combined(problem, model, found),

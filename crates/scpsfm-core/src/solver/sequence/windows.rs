@@ -1,7 +1,7 @@
 //! What windows of a sequence say of each other's focal length.
 
 use super::adjust;
-use super::calibrate::{self, ProjectiveExtract};
+use super::calibrated_views::{self, ProjectiveExtract};
 use super::model::Model;
 use super::options::WindowOptions;
 use crate::domain::Task;
@@ -98,7 +98,7 @@ fn estimates(
 
 /// By how much the log focal length of these views, their mean where each has its own, moves where they are alone.
 fn moved_alone(problem: &Problem, model: &Model, camera: usize, views: &[usize]) -> Option<Estimate> {
-    let extract = calibrate::core(problem, model, views, OPTIONS.of_view);
+    let extract = calibrated_views::core(problem, model, views, OPTIONS.of_view);
     let (metric, _) = extract.block();
     let projective = ProjectiveExtract::of(&metric);
     let to_calibrate = projective.uncalibrated(problem, &metric, &extract.observations, &[None], model.noise);
