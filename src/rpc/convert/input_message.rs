@@ -62,7 +62,7 @@ pub trait InputMessage: Message + Default {
     /// The array with this tag, and its name.
     fn array(&mut self, tag: u32) -> Option<(&'static str, Array<'_>)>;
 
-    /// Refuses what is above the limits by what is claimed and by what has arrived.
+    /// Refuses what is above the limits by what it declares and by what has arrived.
     ///
     /// # Errors
     /// A violation of the first field that is too long.
@@ -72,12 +72,12 @@ pub trait InputMessage: Message + Default {
     }
 }
 
-/// Implements [`InputMessage`]. `head` is what is in no chunk, `declares` what is bounded of that, `head_array` the array
-/// of it.
+/// Implements [`InputMessage`]. `head` is what is in no chunk, `declares` what is bounded of that, `head_array` the
+/// array of it.
 macro_rules! input_messages {
     ($($set:ident, $chunk:ident, $name:literal {
         head: $($head:ident),+;
-        declares: $($claim:ident <= $bound:ident),*;
+        declares: $($declared:ident <= $bound:ident),*;
         head_array: $($head_tag:literal $head_array:ident $head_kind:ident)?;
         arrays: $($tag:literal $array:ident $kind:ident),+;
     })+) => {$(
@@ -101,7 +101,7 @@ macro_rules! input_messages {
 
             fn declared_counts(&self, limits: &Limits) -> impl Iterator<Item = Count> {
                 [
-                    $(Count { name: stringify!($claim), count: self.$claim as usize, max: limits.$bound },)*
+                    $(Count { name: stringify!($declared), count: self.$declared as usize, max: limits.$bound },)*
                     Count { name: "views", count: self.views.len(), max: limits.max_views },
                 ]
                 .into_iter()

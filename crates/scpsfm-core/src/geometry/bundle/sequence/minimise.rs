@@ -67,7 +67,8 @@ pub fn adjust(
     report
 }
 
-/// The same over all poses, points and the free intrinsics, the same of every camera group, on the caller's thread. Focal lengths a view are free only where the reconstruction has them.
+/// As [`adjust`], over all poses and points and one model for every camera group, on the caller's thread. Focal
+/// lengths a view are free only where the reconstruction has them.
 ///
 /// The cost contains what the priors add.
 ///
