@@ -117,7 +117,10 @@ pub enum Notification {
     Missed,
 }
 
-/// A store of jobs, on whichever database; its operations are in `sql/store.rs`.
+/// A store of jobs, on whichever database; its operations are in the files of `sql`, by what they are on. Every
+/// operation is one transaction: state, event and lease change together or not at all.
+///
+/// `now` is the caller's clock, so that tests need not wait; times are kept to the microsecond.
 pub type Store = dyn sql::Database;
 
 /// `Failure::reason` of a job whose workers vanished too often.

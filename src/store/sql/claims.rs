@@ -8,30 +8,42 @@
 
 use std::time::{Duration, SystemTime};
 
+use super::Size::Small;
+use super::WriteIntent::Begins;
+use super::operation::writes;
 use super::rows::{self, LockedJob, insert_event, integer, micros, returning_job, select_locked_job};
-use super::{Connection, Lock, Row, Statement, fairness};
+use super::{Connection, Database, Lock, Row, Statement};
 use crate::domain::job::{EventBody, JobState};
 use crate::store::record::{Claim, Claimed, Claims, Lease, Prefetch};
 use crate::store::{Error, Notification};
+use crate::telemetry::metrics::store_operation;
 
-/// Whether anything is queued that may be begun.
-pub(super) async fn may_claim(connection: &mut dyn Connection) -> Result<bool, Error> {
-    let select = Statement::new(
-        "SELECT EXISTS (SELECT 1 FROM jobs WHERE state = 'QUEUED' AND (SELECT pause_time FROM queue) IS NULL) AS found",
-    );
-    connection.row(select).await?.flag("found")
-}
-
-/// See `Store::claim`.
-///
-/// * `lease_now`: now, on the clock of leases
-pub(super) async fn claim(
-    connection: &mut dyn Connection,
-    claim: &Claim,
-    now: SystemTime,
-    lease_now: SystemTime,
-) -> Result<Claims, Error> {
-    Claiming { connection, claim, now, lease_now }.run().await
+impl dyn Database {
+    /// Leases the next job in the queue and begins it; nothing where none waits, or the queue is paused. Tenants take
+    /// turns, by their weights; within a tenant jobs go by priority, then age. Jobs past their deadline are left to
+    /// `sweep`.
+    ///
+    /// The claim may also prefetch: it leases the job after it, which stays queued until a later claim begins it. Other
+    /// claims pass over a prefetched job until that lease expires, but for those that find no other job. Nothing need
+    /// be given back: a prefetched job that is not begun in time is any worker's, and no attempt was made.
+    ///
+    /// A suspect ([`Claim::suspect_after`]) is leased as long as a job that is begun, and not begun; a claim that is to
+    /// begin it extends that lease, or ends it with a `lease_for` of zero. Where nothing else runs in the process, the
+    /// claim begins it; the same claim once more, for want of an answer, gives the attempt that was begun.
+    pub async fn claim(&self, claim: &Claim, now: SystemTime) -> Result<Claims, Error> {
+        let _timer = store_operation("claim");
+        // At once: `now` is what the wall clock showed at the call, and it may be set before the database answers.
+        let lease_now = self.lease_clock(now);
+        // Idle workers look for jobs again and again: a read is one question over the network, a transaction is three.
+        let waits = "SELECT EXISTS \
+                     (SELECT 1 FROM jobs WHERE state = 'QUEUED' AND (SELECT pause_time FROM queue) IS NULL) AS found";
+        if self.is_shared() && claim.begin.is_none() && !self.finds(Statement::new(waits)).await? {
+            return Ok(Claims::default());
+        }
+        writes!(self, Small, Begins(0), [claim], |connection| {
+            Claiming { connection, claim: &claim, now, lease_now }.run().await
+        })
+    }
 }
 
 /// A claim under way.
@@ -39,6 +51,7 @@ struct Claiming<'a> {
     connection: &'a mut dyn Connection,
     claim: &'a Claim,
     now: SystemTime,
+    /// Now, on the clock of leases.
     lease_now: SystemTime,
 }
 
@@ -73,7 +86,7 @@ impl Claiming<'_> {
     /// The job whose turn it is among those that nobody has a lease on, counted for its tenant; none where it is not
     /// `wanted`.
     async fn next(&mut self, wanted: impl Fn(&LockedJob) -> bool) -> Result<Option<LockedJob>, Error> {
-        for tenant in fairness::turns(self.connection, self.claim, self.lease_now).await? {
+        for tenant in self.connection.turns(self.claim, self.lease_now).await? {
             let first = Statement::new(select_locked_job!(
                 "WHERE state = 'QUEUED' AND tenant = $1 AND (deadline IS NULL OR deadline > $2) \
                  AND (lease_expires IS NULL OR lease_expires <= $3) ORDER BY priority DESC, create_time, id LIMIT 1"
@@ -87,7 +100,7 @@ impl Claiming<'_> {
                 if !wanted(&job) {
                     break;
                 }
-                fairness::count(self.connection, &self.claim.shares, &tenant).await?;
+                self.connection.count_turn(&self.claim.shares, &tenant).await?;
                 return Ok(Some(job));
             }
         }

@@ -3,14 +3,16 @@
 //! [`Database`].
 
 mod admin;
+mod admission;
 mod attempts;
 mod claims;
 mod fairness;
+mod inputs;
 mod jobs;
+mod operation;
 mod removal;
 mod rows;
 mod statement;
-mod store;
 mod uploads;
 mod webhooks;
 
@@ -126,7 +128,7 @@ pub(super) fn operation<C: ?Sized, T>(
     Box::new(run)
 }
 
-/// What a store needs of its database; the store's operations are in `store`.
+/// What a store needs of its database; the store's operations are in the other files of this folder.
 #[async_trait::async_trait]
 pub trait Database: Send + Sync + 'static {
     /// Whether other processes may hold leases and change jobs.

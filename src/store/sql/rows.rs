@@ -153,30 +153,6 @@ impl LockedJob {
     }
 }
 
-/// The page that a query asks for, of what `select` finds beyond its cursor, in order. `id` is the column that tells
-/// those of one time apart.
-pub(super) async fn page<T>(
-    connection: &mut dyn Connection,
-    query: &(impl Paged + Sync),
-    select: Statement,
-    id: &str,
-    item: impl Fn(&Row) -> Result<T, Error>,
-) -> Result<Page<T>, Error> {
-    let size = query.effective_page_size();
-    // One more tells whether there is a next page.
-    let mut rows = connection.rows(select.then(" LIMIT ").then_bind(i64::from(size) + 1)).await?;
-    let more = rows.len() > size as usize;
-    rows.truncate(size as usize);
-    let next_page_token = match rows.last() {
-        Some(last) if more => {
-            let cursor = Cursor { create_micros: last.integer("create_time")?, id: last.text(id)? };
-            Some(query.token_after(&cursor))
-        }
-        _ => None,
-    };
-    Ok(Page { items: rows.iter().map(item).collect::<Result<_, _>>()?, next_page_token })
-}
-
 /// `SELECT` of all that [`LockedJob::from_row`] reads; the clauses follow.
 macro_rules! select_locked_job {
     ($clauses:literal) => {
@@ -188,25 +164,6 @@ macro_rules! select_locked_job {
     };
 }
 pub(super) use select_locked_job;
-
-/// Locks a job: it does not change until the transaction ends.
-pub(super) async fn locked_job(connection: &mut dyn Connection, name: &JobName) -> Result<LockedJob, Error> {
-    let select = Statement::new(select_locked_job!("WHERE tenant = $1 AND job = $2"))
-        .bind(&name.tenant)
-        .bind(&name.job)
-        .then(connection.for_update());
-    let row = connection.optional_row(select).await?;
-    row.as_ref().map_or_else(|| Err(Error::NotFound(name.clone())), LockedJob::from_row)
-}
-
-/// Locks a job that this lease still holds: what every write of a worker begins with.
-pub(super) async fn held(connection: &mut dyn Connection, lease: &Lease) -> Result<LockedJob, Error> {
-    match locked_job(connection, &lease.name).await {
-        Ok(job) if job.state == JobState::Running && job.attempt == lease.attempt => Ok(job),
-        Ok(_) | Err(Error::NotFound(_)) => Err(Error::Fenced(lease.clone())),
-        Err(error) => Err(error),
-    }
-}
 
 /// Stores an event of a job of this row; whoever runs it counts it in the row.
 pub(super) fn insert_event(
@@ -251,56 +208,105 @@ impl Transition<'_> {
     }
 }
 
-/// Moves a job out of its state, with the event that says so: to the queue, or to an end. Its lease ends with it.
-/// Returns the job as it stands then.
-pub(super) async fn transition(
-    connection: &mut dyn Connection,
-    job: &LockedJob,
-    transition: Transition<'_>,
-    now: SystemTime,
-) -> Result<Job, Error> {
-    let Transition { next, failure, summary, result_sha256, progress, attempt_end } = transition;
-    if !job.state.may_become(next) || next == JobState::Running {
-        let (from, to) = (job.state.name(), next.name());
-        return Err(Error::Corrupt(format!("{} cannot go from {from} to {to} here", job.name)));
+impl dyn Connection + '_ {
+    /// The page that a query asks for, of what `select` finds beyond its cursor, in order. `id` is the column that
+    /// tells those of one time apart.
+    pub(super) async fn page<T>(
+        &mut self,
+        query: &(impl Paged + Sync),
+        select: Statement,
+        id: &str,
+        item: impl Fn(&Row) -> Result<T, Error>,
+    ) -> Result<Page<T>, Error> {
+        let size = query.effective_page_size();
+        // One more tells whether there is a next page.
+        let mut rows = self.rows(select.then(" LIMIT ").then_bind(i64::from(size) + 1)).await?;
+        let more = rows.len() > size as usize;
+        rows.truncate(size as usize);
+        let next_page_token = match rows.last() {
+            Some(last) if more => {
+                let cursor = Cursor { create_micros: last.integer("create_time")?, id: last.text(id)? };
+                Some(query.token_after(&cursor))
+            }
+            _ => None,
+        };
+        Ok(Page { items: rows.iter().map(item).collect::<Result<_, _>>()?, next_page_token })
     }
-    let end = attempt_end.map(|end| end_attempt(job, end, now));
-    let mut batch: Vec<Statement> = end.into_iter().collect();
-    let mut sequence = job.last_sequence;
-    if let Some(summary) = summary {
-        sequence += 1;
-        batch.push(insert_event(job.id, sequence, job.attempt, &EventBody::Summary(summary.clone()), now)?);
-    }
-    sequence += 1;
-    let encoded_failure = failure.as_ref().map(payload::encode).transpose()?;
-    batch.push(insert_event(job.id, sequence, job.attempt, &EventBody::State { state: next, failure }, now)?);
-    let update = Statement::new(returning_job!(
-        "UPDATE jobs SET state = $1, lease_worker = NULL, lease_expires = NULL, cancel_requested = FALSE, \
-         queue_time = COALESCE($2, queue_time), end_time = $3, failure = $4, summary = COALESCE($5, summary), \
-         progress = COALESCE($6, progress), last_sequence = $7, result_sha256 = $8 WHERE id = $9"
-    ))
-    .bind(next.name())
-    .bind((next == JobState::Queued).then(|| micros(now)))
-    .bind(next.is_terminal().then(|| micros(now)))
-    .bind(encoded_failure)
-    .bind(summary.map(payload::encode).transpose()?)
-    .bind(progress.map(payload::encode).transpose()?)
-    .bind(integer(sequence))
-    .bind(result_sha256.map(|sha256| sha256.to_vec()))
-    .bind(job.id);
-    batch.push(update);
-    let changed = one_job(&connection.batch(batch).await?)?;
-    if changed.webhook.is_some() && next.is_terminal() {
-        connection.execute(webhooks::due(job.id)).await?;
-    }
-    connection.notify(Notification::Events(job.name.clone())).await?;
-    if next == JobState::Queued {
-        connection.notify(Notification::Queued).await?;
-    }
-    Ok(changed)
-}
 
-/// The job of a batch that changes one.
-pub(super) fn one_job(rows: &[Row]) -> Result<Job, Error> {
-    rows.first().map_or_else(|| Err(Error::Corrupt("a job that was just changed is not there".into())), job)
+    /// Locks a job: it does not change until the transaction ends. With an `etag`, refuses where the caller saw the job
+    /// in another shape.
+    pub(super) async fn locked_job(&mut self, name: &JobName, etag: Option<&str>) -> Result<LockedJob, Error> {
+        let select = Statement::new(select_locked_job!("WHERE tenant = $1 AND job = $2"))
+            .bind(&name.tenant)
+            .bind(&name.job)
+            .then(self.for_update());
+        let row = self.optional_row(select).await?.ok_or_else(|| Error::NotFound(name.clone()))?;
+        if let Some(etag) = etag
+            && self.job(name).await?.etag() != etag
+        {
+            return Err(Error::EtagMismatch(name.clone()));
+        }
+        LockedJob::from_row(&row)
+    }
+
+    /// Locks a job that this lease still holds: what every write of a worker begins with.
+    pub(super) async fn held(&mut self, lease: &Lease) -> Result<LockedJob, Error> {
+        match self.locked_job(&lease.name, None).await {
+            Ok(job) if job.state == JobState::Running && job.attempt == lease.attempt => Ok(job),
+            Ok(_) | Err(Error::NotFound(_)) => Err(Error::Fenced(lease.clone())),
+            Err(error) => Err(error),
+        }
+    }
+
+    /// Moves a job out of its state, with the event that says so: to the queue, or to an end. Its lease ends with it.
+    /// Returns the job as it stands then.
+    pub(super) async fn transition(
+        &mut self,
+        job: &LockedJob,
+        transition: Transition<'_>,
+        now: SystemTime,
+    ) -> Result<Job, Error> {
+        let Transition { next, failure, summary, result_sha256, progress, attempt_end } = transition;
+        if !job.state.may_become(next) || next == JobState::Running {
+            let (from, to) = (job.state.name(), next.name());
+            return Err(Error::Corrupt(format!("{} cannot go from {from} to {to} here", job.name)));
+        }
+        let end = attempt_end.map(|end| end_attempt(job, end, now));
+        let mut batch: Vec<Statement> = end.into_iter().collect();
+        let mut sequence = job.last_sequence;
+        if let Some(summary) = summary {
+            sequence += 1;
+            batch.push(insert_event(job.id, sequence, job.attempt, &EventBody::Summary(summary.clone()), now)?);
+        }
+        sequence += 1;
+        let encoded_failure = failure.as_ref().map(payload::encode).transpose()?;
+        batch.push(insert_event(job.id, sequence, job.attempt, &EventBody::State { state: next, failure }, now)?);
+        let update = Statement::new(returning_job!(
+            "UPDATE jobs SET state = $1, lease_worker = NULL, lease_expires = NULL, cancel_requested = FALSE, \
+             queue_time = COALESCE($2, queue_time), end_time = $3, failure = $4, summary = COALESCE($5, summary), \
+             progress = COALESCE($6, progress), last_sequence = $7, result_sha256 = $8 WHERE id = $9"
+        ))
+        .bind(next.name())
+        .bind((next == JobState::Queued).then(|| micros(now)))
+        .bind(next.is_terminal().then(|| micros(now)))
+        .bind(encoded_failure)
+        .bind(summary.map(payload::encode).transpose()?)
+        .bind(progress.map(payload::encode).transpose()?)
+        .bind(integer(sequence))
+        .bind(result_sha256.map(|sha256| sha256.to_vec()))
+        .bind(job.id);
+        batch.push(update);
+        let changed = match self.batch(batch).await?.first() {
+            Some(row) => self::job(row)?,
+            None => return Err(Error::Corrupt("a job that was just changed is not there".into())),
+        };
+        if changed.webhook.is_some() && next.is_terminal() {
+            self.execute(webhooks::due(job.id)).await?;
+        }
+        self.notify(Notification::Events(job.name.clone())).await?;
+        if next == JobState::Queued {
+            self.notify(Notification::Queued).await?;
+        }
+        Ok(changed)
+    }
 }
