@@ -1,6 +1,6 @@
 //! What operators ask for: retries, priorities, pauses of the queue, a drain.
 
-use super::{Engine, Error, Inner, Phase, QueueReport, finished, observe};
+use super::{Engine, Error, QueueReport, finished, observe};
 use crate::domain::job::{Job, JobName};
 
 impl Engine {
@@ -11,9 +11,21 @@ impl Engine {
     /// [`StoreError::NotFound`], [`StoreError::EtagMismatch`], [`StoreError::Succeeded`], [`StoreError::QueueFull`],
     /// [`Error::Draining`].
     pub async fn retry(&self, name: &JobName, etag: Option<String>) -> Result<Job, Error> {
+        self.inner.check_open().inspect_err(|_| observe::refused(observe::Refusal::Draining))?;
         let (inner, name) = (self.inner.clone(), name.clone());
+        let retry = async move {
+            let retried = inner.store.retry_job(&name, etag.as_deref(), &inner.options.queue, inner.now()).await;
+            let reply = retried.inspect_err(observe::refused_by_store)?;
+            if reply.by_this_call {
+                tracing::info!(job = %name, "retried");
+                inner.notifier.wake(&name);
+                inner.work_waits();
+                inner.queue_changed();
+            }
+            Ok::<_, Error>(inner.dated(reply.job))
+        };
         // On its own task: a caller that goes away must not leave a queued job untold.
-        finished(tokio::spawn(async move { inner.retry(&name, etag.as_deref()).await })).await
+        finished(tokio::spawn(retry)).await
     }
 
     /// Changes the priority of a queued job; with an etag, only where it is the job's.
@@ -53,23 +65,5 @@ impl Engine {
     /// Waits until a drain is asked for.
     pub fn drain_asked(&self) -> impl Future<Output = ()> + Send + use<> {
         self.inner.drain_asked.clone().cancelled_owned()
-    }
-}
-
-impl Inner {
-    async fn retry(&self, name: &JobName, etag: Option<&str>) -> Result<Job, Error> {
-        if self.phase() != Phase::Open {
-            observe::refused(observe::Refusal::Draining);
-            return Err(Error::Draining);
-        }
-        let retried = self.store.retry_job(name, etag, &self.options.queue, self.now()).await;
-        let reply = retried.inspect_err(observe::refused_by_store)?;
-        if reply.by_this_call {
-            tracing::info!(job = %name, "retried");
-            self.notifier.wake(name);
-            self.work_waits();
-            self.queue_changed();
-        }
-        Ok(self.dated(reply.job))
     }
 }

@@ -1,4 +1,4 @@
-//! Hiring the workers at the start, and letting them go at the end.
+//! Starting the workers, and ending them in a drain.
 
 use std::sync::Arc;
 use std::time::Duration;
@@ -8,7 +8,7 @@ use tokio::task::JoinSet;
 use tokio::time::timeout;
 
 use super::worker::Worker;
-use super::{Error, Inner, Phase, ResultEncoder, Solver, locked, slot, webhooks};
+use super::{Engine, Error, Inner, Phase, ResultEncoder, Solver, locked, slot, webhooks};
 use crate::domain::StopReason;
 
 /// How long a job that was asked to stop may take to do so: ten times the solver's promise of 200 ms, and a slow disk.
@@ -56,7 +56,7 @@ impl Threads {
 
 impl Inner {
     /// Starts the slots of these workers and the sweeper.
-    pub(super) fn hire(self: &Arc<Self>, threads: Threads) -> Result<(), Error> {
+    pub(super) fn start_workers(self: &Arc<Self>, threads: Threads) -> Result<(), Error> {
         let mut pool = WorkerPool { threads_ended: Some(threads.ended), ..WorkerPool::default() };
         for worker in threads.workers {
             pool.slots.spawn(slot::run(self.clone(), worker));
@@ -83,9 +83,14 @@ impl Inner {
             locked(&self.pool).drained.given_back += 1;
         }
     }
+}
 
-    pub(super) async fn drain(self: Arc<Self>, bound: Duration) -> Drained {
-        let begun = self.phase.send_if_modified(|phase| {
+impl Engine {
+    /// Stops claiming, lets what runs finish within `bound`, gives the rest back to the queue, ends the workers and
+    /// the watchers. A second call returns at once with nothing done.
+    pub async fn drain(&self, bound: Duration) -> Drained {
+        let inner = &self.inner;
+        let begun = inner.phase.send_if_modified(|phase| {
             let first = *phase == Phase::Open;
             if first {
                 *phase = Phase::Draining;
@@ -96,14 +101,14 @@ impl Inner {
             return Drained::default();
         }
         let (mut slots, mut others, threads_ended) = {
-            let mut pool = locked(&self.pool);
+            let mut pool = locked(&inner.pool);
             (std::mem::take(&mut pool.slots), std::mem::take(&mut pool.others), pool.threads_ended.take())
         };
         let in_time = timeout(bound, all_ended(&mut slots));
-        if !matches!(self.interrupted.run_until_cancelled(in_time).await, Some(Ok(()))) {
+        if !matches!(inner.interrupted.run_until_cancelled(in_time).await, Some(Ok(()))) {
             // Before the look: whoever is listed after it finds this.
-            self.interrupted.cancel();
-            for listed in locked(&self.running).values() {
+            inner.interrupted.cancel();
+            for listed in locked(&inner.running).values() {
                 listed.stop.stop(StopReason::Interrupted);
             }
             if timeout(GIVE_BACK_GRACE, all_ended(&mut slots)).await.is_err() {
@@ -112,12 +117,12 @@ impl Inner {
                 slots.abort_all();
             }
         }
-        self.phase.send_replace(Phase::Closed);
+        inner.phase.send_replace(Phase::Closed);
         // Those that do not end in time wait for a store or a receiver that hangs. Dropping the set aborts them: neither
         // another server nor the next start needs them.
         let others_ended = timeout(GIVE_BACK_GRACE, all_ended(&mut others));
         let _ = tokio::join!(others_ended, threads_end(threads_ended));
-        locked(&self.pool).drained
+        locked(&inner.pool).drained
     }
 }
 

@@ -23,7 +23,7 @@ mod worker;
 mod tests;
 
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
-use std::time::{Duration, SystemTime};
+use std::time::SystemTime;
 
 use tokio::sync::{Notify, watch as channel};
 use tokio_util::sync::CancellationToken;
@@ -173,20 +173,9 @@ impl Engine {
             );
         }
         inner.taken_back(&recovered);
-        inner.hire(threads)?;
+        inner.start_workers(threads)?;
         inner.queue_changed();
         Ok(Self { inner })
-    }
-
-    /// Admits and stores jobs, all or none; the answers are in their order. A repeated request id with the same body
-    /// gives the job that the first call made.
-    ///
-    /// # Errors
-    /// Of the first job that is refused: [`StoreError::QueueFull`] at once when too much waits,
-    /// [`StoreError::BatchTooLarge`], [`Error::JobTooLarge`], [`StoreError::AlreadyExists`] for a taken job id or a
-    /// request id with another body, [`Error::InvalidArgument`], [`Error::Draining`].
-    pub async fn submit_batch(&self, news: Vec<NewJob>) -> Result<Vec<Job>, Error> {
-        self.inner.clone().submit_batch(news).await
     }
 
     /// One job.
@@ -207,14 +196,6 @@ impl Engine {
         Ok(Page { items: jobs, ..page })
     }
 
-    /// Replays a job's events after a sequence number (0: all of them), then follows it to its end. See [`Watch`].
-    ///
-    /// # Errors
-    /// [`StoreError::NotFound`]; [`Error::InvalidArgument`] for a number beyond the job's latest event.
-    pub async fn watch(&self, name: &JobName, after_sequence: u64) -> Result<Watch, Error> {
-        Watch::open(self.inner.clone(), name.clone(), after_sequence).await
-    }
-
     /// Ends a queued job, asks a running one to stop, leaves an ended one as it is; with an etag, only where it is the
     /// job's. Returns the job as it stands then: a running one ends soon after, which its events tell.
     ///
@@ -222,8 +203,16 @@ impl Engine {
     /// [`StoreError::NotFound`], [`StoreError::EtagMismatch`].
     pub async fn cancel(&self, name: &JobName, etag: Option<String>) -> Result<Job, Error> {
         let (inner, name) = (self.inner.clone(), name.clone());
+        let cancel = async move {
+            let reply = inner.store.request_cancel(&name, etag.as_deref(), inner.now()).await?;
+            inner.stop_attempts(&name);
+            if reply.by_this_call {
+                inner.ended(&reply.job);
+            }
+            Ok::<_, Error>(inner.dated(reply.job))
+        };
         // On its own task: a caller that goes away must not leave a stored cancel untold.
-        finished(tokio::spawn(async move { inner.cancel(&name, etag.as_deref()).await })).await
+        finished(tokio::spawn(cancel)).await
     }
 
     /// Counts that a call was disconnected whose submission had `cancel_on_disconnect`; `created` is the job's time of
@@ -290,12 +279,6 @@ impl Engine {
     pub fn interrupt_running(&self) {
         self.inner.interrupted.cancel();
     }
-
-    /// Stops claiming, lets what runs finish within `bound`, gives the rest back to the queue, ends the workers and
-    /// the watchers. A second call returns at once with nothing done.
-    pub async fn drain(&self, bound: Duration) -> Drained {
-        self.inner.clone().drain(bound).await
-    }
 }
 
 impl std::fmt::Debug for Engine {
@@ -307,6 +290,14 @@ impl std::fmt::Debug for Engine {
 impl Inner {
     fn phase(&self) -> Phase {
         *self.phase.borrow()
+    }
+
+    /// Refuses what is new while the server drains.
+    ///
+    /// # Errors
+    /// [`Error::Draining`].
+    fn check_open(&self) -> Result<(), Error> {
+        if self.phase() == Phase::Open { Ok(()) } else { Err(Error::Draining) }
     }
 
     fn now(&self) -> SystemTime {
@@ -327,15 +318,6 @@ impl Inner {
     fn dated(&self, job: Job) -> Job {
         let expire_time = job.end_time.zip(self.options.retention).and_then(|(end, kept)| end.checked_add(kept));
         Job { expire_time, ..job }
-    }
-
-    async fn cancel(&self, name: &JobName, etag: Option<&str>) -> Result<Job, Error> {
-        let reply = self.store.request_cancel(name, etag, self.now()).await?;
-        self.stop_attempts(name);
-        if reply.by_this_call {
-            self.ended(&reply.job);
-        }
-        Ok(self.dated(reply.job))
     }
 
     /// Tells everyone that a job ended; called once a job, by whoever committed its end.

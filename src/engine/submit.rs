@@ -1,12 +1,11 @@
 //! Admission: from what a caller wants to a stored job, or a refusal.
 
 use std::collections::BTreeMap;
-use std::sync::Arc;
 use std::time::{Duration, SystemTime};
 
 use sha2::{Digest, Sha256};
 
-use super::{Error, Inner, Phase, StoreError, WebhookOptions, finished, observe, webhooks};
+use super::{Engine, Error, Inner, StoreError, WebhookOptions, finished, observe, webhooks};
 use crate::domain::error::{Violation, Violations, quoted};
 use crate::domain::job::{Job, JobName};
 use crate::domain::{Backend, Input, InputName, Oversize, Quota, SolveSettings};
@@ -54,8 +53,7 @@ pub struct NewJob {
     pub labels: BTreeMap<String, String>,
     /// W3C `traceparent` of the call.
     pub trace_parent: Option<String>,
-    /// Whether the call attaches to the job, see [`Engine::detach`](super::Engine::detach). No part of what makes two
-    /// requests the same.
+    /// Whether the call attaches to the job, see [`Engine::detach`]. No part of what makes two requests the same.
     pub cancel_on_disconnect: bool,
     /// Where the job's end is to be sent.
     pub webhook_url: Option<String>,
@@ -178,15 +176,20 @@ impl NewJob {
     }
 }
 
-impl Inner {
-    pub(super) async fn submit_batch(self: Arc<Self>, news: Vec<NewJob>) -> Result<Vec<Job>, Error> {
-        news.iter().try_for_each(|new| new.validate(self.options.webhooks.as_ref()))?;
-        if self.phase() != Phase::Open {
-            observe::refused(observe::Refusal::Draining);
-            return Err(Error::Draining);
-        }
-        let now = self.now();
-        let backend = self.options.backend;
+impl Engine {
+    /// Admits and stores jobs, all or none; the answers are in their order. A repeated request id with the same body
+    /// gives the job that the first call made.
+    ///
+    /// # Errors
+    /// Of the first job that is refused: [`StoreError::QueueFull`] at once when too much waits,
+    /// [`StoreError::BatchTooLarge`], [`Error::JobTooLarge`], [`StoreError::AlreadyExists`] for a taken job id or a
+    /// request id with another body, [`Error::InvalidArgument`], [`Error::Draining`].
+    pub async fn submit_batch(&self, news: Vec<NewJob>) -> Result<Vec<Job>, Error> {
+        let inner = self.inner.clone();
+        news.iter().try_for_each(|new| new.validate(inner.options.webhooks.as_ref()))?;
+        inner.check_open().inspect_err(|_| observe::refused(observe::Refusal::Draining))?;
+        let now = inner.now();
+        let backend = inner.options.backend;
         let mut observations = 0;
         let mut uploaded = Vec::new();
         for new in &news {
@@ -195,7 +198,7 @@ impl Inner {
                     observations += input.observation_count();
                     None
                 }
-                JobInput::Uploaded(name) => Some(self.store.uploaded_input(name).await?),
+                JobInput::Uploaded(name) => Some(inner.store.uploaded_input(name).await?),
             });
         }
         let encode = move || {
@@ -207,19 +210,21 @@ impl Inner {
         } else {
             finished(tokio::task::spawn_blocking(encode)).await?
         };
-        let max = self.options.max_solver_bytes;
+        let max = inner.options.max_solver_bytes;
         for (index, new) in records.iter().enumerate() {
             let asked = solver::estimated_bytes(new.view_count, new.track_count, new.observation_count);
             // A repeated request gets its job, which may have been created under a larger bound.
-            if asked > max && !self.is_created(new).await? {
+            if asked > max && !inner.is_created(new).await? {
                 observe::refused(observe::Refusal::JobTooLarge);
                 return Err(Error::JobTooLarge { index, oversize: Oversize { quota: Quota::SolverBytes, asked, max } });
             }
         }
         // On its own task: a caller that goes away must not leave a stored job untold.
-        finished(tokio::spawn(async move { self.store_jobs(records, now).await })).await
+        finished(tokio::spawn(async move { inner.store_jobs(records, now).await })).await
     }
+}
 
+impl Inner {
     /// Whether an earlier call with the same request id has created the job.
     async fn is_created(&self, new: &NewRecord) -> Result<bool, Error> {
         let Some(request) = &new.request else { return Ok(false) };

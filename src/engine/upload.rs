@@ -3,7 +3,7 @@
 use std::sync::Arc;
 use std::time::Duration;
 
-use super::{Engine, Error, Inner, Phase, finished, observe};
+use super::{Engine, Error, Inner, finished, observe};
 use crate::domain::{Input, InputName};
 use crate::store::{
     self, BegunUpload, InputQuery, NewInput, NewUpload, Page, StoredInput, UploadBounds, UploadLease, UploadStatus,
@@ -107,14 +107,6 @@ impl Engine {
 }
 
 impl Inner {
-    /// Refuses what is new while the server drains.
-    ///
-    /// # Errors
-    /// [`Error::Draining`].
-    fn check_open(&self) -> Result<(), Error> {
-        if self.phase() == Phase::Open { Ok(()) } else { Err(Error::Draining) }
-    }
-
     /// Gives up what nobody goes on with, and removes what is of no use any more.
     pub(super) async fn tidy_uploads(&self) {
         let before = |kept: Option<Duration>| kept.and_then(|kept| self.now().checked_sub(kept));

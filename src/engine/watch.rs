@@ -8,7 +8,7 @@ use futures_util::stream::{self, Stream};
 use tokio::sync::watch as channel;
 
 use super::notifier::Subscription;
-use super::{Error, Inner, Phase};
+use super::{Engine, Error, Inner, Phase};
 use crate::domain::Violation;
 use crate::domain::job::{EventBody, JobEvent, JobName};
 
@@ -47,8 +47,14 @@ impl std::fmt::Debug for Watch {
     }
 }
 
-impl Watch {
-    pub(super) async fn open(inner: Arc<Inner>, name: JobName, after: u64) -> Result<Self, Error> {
+impl Engine {
+    /// Replays a job's events after a sequence number (0: all of them), then follows it to its end. See [`Watch`].
+    ///
+    /// # Errors
+    /// [`StoreError::NotFound`](super::StoreError::NotFound); [`Error::InvalidArgument`] for a number beyond the job's
+    /// latest event.
+    pub async fn watch(&self, name: &JobName, after: u64) -> Result<Watch, Error> {
+        let (inner, name) = (self.inner.clone(), name.clone());
         // First listen, then look: what is committed in between is seen either way.
         let subscription = inner.notifier.subscribe(&name);
         let version = subscription.channel().version.subscribe();
@@ -65,7 +71,7 @@ impl Watch {
         // An end is the last event as long as the job is not retried: nothing to wait for.
         let ended = job.state.is_terminal() && after == job.last_sequence;
         let phase = inner.phase.subscribe();
-        Ok(Self {
+        Ok(Watch {
             inner,
             name,
             version,
@@ -78,7 +84,9 @@ impl Watch {
             _subscription: subscription,
         })
     }
+}
 
+impl Watch {
     /// The next event; `None` after the job's end. After an error nothing follows.
     ///
     /// Dropping the future loses nothing.

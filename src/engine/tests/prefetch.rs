@@ -100,9 +100,10 @@ async fn cancelled_before_it_is_begun_it_ends_so_whoever_has_it() {
 async fn cancelled_between_its_begin_and_its_lease_it_leaves_nothing() {
     let (test, [solved, next]) = prefetched().await;
     let (go, held) = test.store.hold().await;
-    let mut cancelling = pin!(test.engine.inner.cancel(&next, None));
-    // Polled once, it is in the writer's queue.
+    let mut cancelling = pin!(test.engine.cancel(&next, None));
     assert!((&mut cancelling).now_or_never().is_none());
+    // Polled once, its task is in the writer's queue.
+    tokio::task::yield_now().await;
     test.solver.release();
     eventually(|| async { (test.solver.calls.load(Ordering::SeqCst) == 2).then_some(()) }).await;
     drop(go);
