@@ -27,12 +27,6 @@ pub struct Count {
     pub max: usize,
 }
 
-impl Count {
-    fn of<T>(array: &'static str, entries: &[T], limits: &Limits) -> Self {
-        Self { name: array, count: entries.len(), max: max_entries(array, limits) }
-    }
-}
-
 /// An input in one message, or as a head and chunks.
 pub trait InputMessage: Message + Default {
     type Chunk;
@@ -59,8 +53,8 @@ pub trait InputMessage: Message + Default {
     /// Bytes that it takes in memory; those of matches count as often as joining needs them.
     fn bytes(&self) -> u64;
 
-    /// The array with this tag, and its name.
-    fn array(&mut self, tag: u32) -> Option<(&'static str, Array<'_>)>;
+    /// The array with this tag, its name, and how many entries it may have.
+    fn array(&mut self, tag: u32, limits: &Limits) -> Option<(&'static str, Array<'_>, usize)>;
 
     /// Refuses what is above the limits by what it declares and by what has arrived.
     ///
@@ -73,13 +67,14 @@ pub trait InputMessage: Message + Default {
 }
 
 /// Implements [`InputMessage`]. `head` is what is in no chunk, `declares` what is bounded of that, `head_array` the
-/// array of it.
+/// array of it. An array has its tag, its name, its kind, how many copies count as held where it is more than one, and
+/// its bound.
 macro_rules! input_messages {
     ($($set:ident, $chunk:ident, $name:literal {
         head: $($head:ident),+;
         declares: $($declared:ident <= $bound:ident),*;
-        head_array: $($head_tag:literal $head_array:ident $head_kind:ident)?;
-        arrays: $($tag:literal $array:ident $kind:ident),+;
+        head_array: $($head_tag:literal $head_array:ident $head_kind:ident <= $head_max:ident)?;
+        arrays: $($tag:literal $array:ident $kind:ident $(x $copies:ident)? <= $max:ident $(* $times:literal)?),+;
     })+) => {$(
         impl InputMessage for proto::$set {
             type Chunk = proto::$chunk;
@@ -109,23 +104,28 @@ macro_rules! input_messages {
 
             fn array_counts(&self, limits: &Limits) -> impl Iterator<Item = Count> {
                 [
-                    $(Count::of(stringify!($head_array), &self.$head_array, limits),)?
-                    $(Count::of(stringify!($array), &self.$array, limits),)+
+                    $((stringify!($head_array), self.$head_array.len(), limits.$head_max),)?
+                    $((stringify!($array), self.$array.len(), limits.$max $(.saturating_mul($times))?),)+
                 ]
                 .into_iter()
+                .map(|(name, count, max)| Count { name, count, max })
             }
 
             fn bytes(&self) -> u64 {
-                let of_head = 0 $(+ bytes_of(stringify!($head_array), &self.$head_array))?;
-                of_head + bytes_of("views", &self.views) $(+ bytes_of(stringify!($array), &self.$array))+
+                bytes_of(&self.views) $(+ bytes_of(&self.$head_array))? $(+ bytes_of(&self.$array) $(* $copies)?)+
             }
 
-            fn array(&mut self, tag: u32) -> Option<(&'static str, Array<'_>)> {
-                match tag {
-                    $($head_tag => Some((stringify!($head_array), Array::$head_kind(&mut self.$head_array))),)?
-                    $($tag => Some((stringify!($array), Array::$kind(&mut self.$array))),)+
-                    _ => None,
-                }
+            fn array(&mut self, tag: u32, limits: &Limits) -> Option<(&'static str, Array<'_>, usize)> {
+                Some(match tag {
+                    $($head_tag => {
+                        (stringify!($head_array), Array::$head_kind(&mut self.$head_array), limits.$head_max)
+                    })?
+                    $($tag => {
+                        let max = limits.$max $(.saturating_mul($times))?;
+                        (stringify!($array), Array::$kind(&mut self.$array), max)
+                    })+
+                    _ => return None,
+                })
             }
         }
     )+};
@@ -136,39 +136,39 @@ input_messages! {
         head: track_count, views;
         declares: track_count <= max_tracks;
         head_array: ;
-        arrays: 3 view_indices Integers, 4 track_indices Integers, 5 xs Reals, 6 ys Reals, 7 sigmas_px Reals,
-            8 depths Reals;
+        arrays:
+            3 view_indices Integers <= max_observations,
+            4 track_indices Integers <= max_observations,
+            5 xs Reals <= max_observations,
+            6 ys Reals <= max_observations,
+            7 sigmas_px Reals <= max_observations,
+            8 depths Reals <= max_observations;
     }
     MeasurementMatrix, MeasurementMatrixChunk, "measurement_matrix" {
         head: view_count, track_count, has_depths, views;
         declares: view_count <= max_views, track_count <= max_tracks;
         head_array: ;
-        arrays: 3 values Reals, 5 visibility Bytes;
+        arrays:
+            3 values Reals <= max_observations * 3,
+            5 visibility Bytes <= max_observations;
     }
     MatchSet, MatchSetChunk, "match_set" {
         head: keypoint_counts, views;
         declares: ;
-        head_array: 2 keypoint_counts Integers;
-        arrays: 3 xs Reals, 4 ys Reals, 5 first_view_indices Integers, 6 second_view_indices Integers,
-            7 match_counts Integers, 8 first_keypoint_indices Integers, 9 second_keypoint_indices Integers;
+        head_array: 2 keypoint_counts Integers <= max_views;
+        arrays:
+            3 xs Reals <= max_observations,
+            4 ys Reals <= max_observations,
+            5 first_view_indices Integers <= max_observations,
+            6 second_view_indices Integers <= max_observations,
+            7 match_counts Integers <= max_observations,
+            8 first_keypoint_indices Integers x JOINING_COPIES <= max_observations,
+            9 second_keypoint_indices Integers x JOINING_COPIES <= max_observations;
     }
 }
 
-/// Entries that an array may have at most.
-pub fn max_entries(array: &str, limits: &Limits) -> usize {
-    match array {
-        "keypoint_counts" => limits.max_views,
-        "values" => limits.max_observations.saturating_mul(3),
-        _ => limits.max_observations,
-    }
-}
-
-fn bytes_of<T>(array: &str, entries: &Vec<T>) -> u64 {
-    let copies = match array {
-        "first_keypoint_indices" | "second_keypoint_indices" => JOINING_COPIES,
-        _ => 1,
-    };
-    copies * (entries.capacity() * size_of::<T>()) as u64
+fn bytes_of<T>(entries: &Vec<T>) -> u64 {
+    (entries.capacity() * size_of::<T>()) as u64
 }
 
 fn part<T: Clone>(entries: &[T], number: usize) -> Vec<T> {

@@ -5,7 +5,7 @@ use prost::bytes::Buf;
 use prost::encoding::{DecodeContext, WireType, decode_key, decode_varint, skip_field};
 
 use super::input::Draft;
-use super::input_message::{Array, InputMessage, max_entries};
+use super::input_message::{Array, InputMessage};
 use crate::domain::{InvalidInput, Limits, Violation};
 use crate::rpc::proto;
 use proto::create_job_request::Source as Inline;
@@ -71,8 +71,8 @@ fn merged<S: InputMessage>(buf: &mut impl Buf, mut set: S, limits: &Limits) -> R
     let end = buf.remaining() - length;
     while buf.remaining() > end {
         let (tag, wire) = decode_key(buf).map_err(malformed)?;
-        match set.array(tag).filter(|_| wire == WireType::LengthDelimited) {
-            Some((name, array)) => decode_array(buf, array, &format!("{}.{name}", S::NAME), max_entries(name, limits))?,
+        match set.array(tag, limits).filter(|_| wire == WireType::LengthDelimited) {
+            Some((name, array, max)) => decode_array(buf, array, &format!("{}.{name}", S::NAME), max)?,
             None => {
                 set.merge_field(tag, wire, buf, DecodeContext::default()).map_err(malformed)?;
                 set.check_counts(limits)?;
