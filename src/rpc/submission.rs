@@ -16,6 +16,7 @@ use crate::domain::{InputName, InvalidInput, Limits, Violation};
 use crate::engine::{self, Engine, JobInput, NewJob};
 use crate::telemetry::metrics::{Refusal, refused};
 use proto::create_job_request::Source as Inline;
+use proto::input_data::Data;
 use proto::solve_request::Message;
 
 /// How long a stream may be silent before its input is complete. A dead connection is found by keep-alive long before;
@@ -52,9 +53,13 @@ impl Submission {
     ) -> Result<Self, Status> {
         let tenant = caller.parent(&request.parent)?;
         let description = create::from_wire(request.job_id, request.request_id, request.job).map_err(invalid)?;
+        let draft = |data| Draft::begin(data, limits).map(Source::Draft).map_err(invalid);
         let input = match request.source {
             Some(Inline::Input(name)) => Source::Uploaded(caller.input(&name, "input")?),
-            input => Source::Draft(Draft::begin(input, limits).map_err(invalid)?),
+            Some(Inline::TrackSet(set)) => draft(Some(Data::TrackSet(set)))?,
+            Some(Inline::MeasurementMatrix(matrix)) => draft(Some(Data::MeasurementMatrix(matrix)))?,
+            Some(Inline::MatchSet(set)) => draft(Some(Data::MatchSet(set)))?,
+            None => draft(None)?,
         };
         let permit = permit.clone();
         let mut submission = Self { tenant, description, input, permit, charged_bytes: 0 };

@@ -5,7 +5,7 @@ use super::{matches, matrix, size_to_wire};
 use crate::domain::{FocalPrior, ImageSize, Input, InvalidInput, Limits, RawInput, View, Violation};
 use crate::engine::StoredInput;
 use crate::rpc::proto;
-use proto::create_job_request::Source as Inline;
+use proto::input_data::Data;
 use proto::solve_request::Message;
 
 /// Bytes of an observation in memory at most: a view, a track, and four reals.
@@ -14,15 +14,8 @@ pub const OBSERVATION_BYTES: u64 = 2 * 4 + 4 * 8;
 /// An input that may not be complete yet. Never holds more than the limits allow and one message on top.
 #[derive(Debug)]
 pub struct Draft {
-    body: Body,
+    data: Data,
     limits: Limits,
-}
-
-#[derive(Debug)]
-enum Body {
-    TrackSet(proto::TrackSet),
-    Matrix(proto::MeasurementMatrix),
-    Matches(proto::MatchSet),
 }
 
 /// The field of a message that follows the config.
@@ -40,20 +33,11 @@ impl Draft {
     ///
     /// # Errors
     /// A violation of `source` where there is none; see [`Draft::check_size`].
-    pub fn begin(input: Option<Inline>, limits: &Limits) -> Result<Self, InvalidInput> {
-        let body = match input {
-            Some(Inline::TrackSet(set)) => Body::TrackSet(set),
-            Some(Inline::MeasurementMatrix(matrix)) => Body::Matrix(matrix),
-            Some(Inline::MatchSet(set)) => Body::Matches(set),
-            Some(Inline::Input(_)) | None => {
-                return Err(Violation::of(
-                    "source",
-                    "is not set; give a track_set, a measurement_matrix, a match_set or the name of an uploaded input",
-                )
-                .into());
-            }
-        };
-        Ok(Self { body, limits: limits.clone() })
+    pub fn begin(data: Option<Data>, limits: &Limits) -> Result<Self, InvalidInput> {
+        let missing =
+            "is not set; give a track_set, a measurement_matrix, a match_set or the name of an uploaded input";
+        let data = data.ok_or_else(|| Violation::of("source", missing))?;
+        Ok(Self { data, limits: limits.clone() })
     }
 
     /// Appends a chunk.
@@ -61,15 +45,15 @@ impl Draft {
     /// # Errors
     /// A violation where the input is of another kind; see [`Draft::check_size`].
     pub fn append(&mut self, message: Message) -> Result<(), InvalidInput> {
-        match (&mut self.body, message) {
-            (Body::TrackSet(set), Message::TrackSetChunk(chunk)) => set.append(chunk),
-            (Body::Matrix(matrix), Message::MeasurementMatrixChunk(chunk)) => matrix.append(chunk),
-            (Body::Matches(set), Message::MatchSetChunk(chunk)) => set.append(chunk),
-            (body, other) => {
-                let kind = match body {
-                    Body::TrackSet(_) => proto::TrackSet::NAME,
-                    Body::Matrix(_) => proto::MeasurementMatrix::NAME,
-                    Body::Matches(_) => proto::MatchSet::NAME,
+        match (&mut self.data, message) {
+            (Data::TrackSet(set), Message::TrackSetChunk(chunk)) => set.append(chunk),
+            (Data::MeasurementMatrix(matrix), Message::MeasurementMatrixChunk(chunk)) => matrix.append(chunk),
+            (Data::MatchSet(set), Message::MatchSetChunk(chunk)) => set.append(chunk),
+            (data, other) => {
+                let kind = match data {
+                    Data::TrackSet(_) => proto::TrackSet::NAME,
+                    Data::MeasurementMatrix(_) => proto::MeasurementMatrix::NAME,
+                    Data::MatchSet(_) => proto::MatchSet::NAME,
                 };
                 return Err(Violation::of(field_of(&other), format!("the config holds a {kind}")).into());
             }
@@ -83,19 +67,19 @@ impl Draft {
     /// # Errors
     /// A violation of the first field that is too long.
     pub fn check_size(&self) -> Result<(), InvalidInput> {
-        match &self.body {
-            Body::TrackSet(set) => set.check_counts(&self.limits),
-            Body::Matrix(matrix) => matrix::check_size(matrix, &self.limits),
-            Body::Matches(set) => set.check_counts(&self.limits),
+        match &self.data {
+            Data::TrackSet(set) => set.check_counts(&self.limits),
+            Data::MeasurementMatrix(matrix) => matrix::check_size(matrix, &self.limits),
+            Data::MatchSet(set) => set.check_counts(&self.limits),
         }
     }
 
     /// Bytes that it takes in memory, see [`InputMessage::bytes`].
     pub fn bytes(&self) -> u64 {
-        match &self.body {
-            Body::TrackSet(set) => set.bytes(),
-            Body::Matrix(matrix) => matrix.bytes(),
-            Body::Matches(set) => set.bytes(),
+        match &self.data {
+            Data::TrackSet(set) => set.bytes(),
+            Data::MeasurementMatrix(matrix) => matrix.bytes(),
+            Data::MatchSet(set) => set.bytes(),
         }
     }
 
@@ -104,10 +88,10 @@ impl Draft {
     /// # Errors
     /// Every violation found, by field and index.
     pub fn finish(self) -> Result<Input, InvalidInput> {
-        match self.body {
-            Body::TrackSet(set) => Input::new(track_set_to_raw(set), &self.limits, proto::TrackSet::NAME),
-            Body::Matrix(matrix) => matrix::to_input(matrix, &self.limits),
-            Body::Matches(set) => matches::to_raw(set).into_input(&self.limits, proto::MatchSet::NAME),
+        match self.data {
+            Data::TrackSet(set) => Input::new(track_set_to_raw(set), &self.limits, proto::TrackSet::NAME),
+            Data::MeasurementMatrix(matrix) => matrix::to_input(matrix, &self.limits),
+            Data::MatchSet(set) => matches::to_raw(set).into_input(&self.limits, proto::MatchSet::NAME),
         }
     }
 }
@@ -204,7 +188,7 @@ mod tests {
         let raw = raw(CHUNK_ENTRIES + 7);
         let limits = Limits::default();
         let set = to_wire(raw.clone());
-        let mut draft = Draft::begin(Some(Inline::TrackSet(set.head())), &limits).expect("a head");
+        let mut draft = Draft::begin(Some(Data::TrackSet(set.head())), &limits).expect("a head");
         let mut count = 0;
         while let Some(chunk) = set.chunk(count) {
             draft.append(Message::TrackSetChunk(chunk)).expect("a chunk");
@@ -212,7 +196,7 @@ mod tests {
             count += 1;
         }
         assert_eq!(count, 2);
-        let whole = Draft::begin(Some(Inline::TrackSet(set)), &limits).expect("a whole");
+        let whole = Draft::begin(Some(Data::TrackSet(set)), &limits).expect("a whole");
         let expected = Input::new(raw, &limits, proto::TrackSet::NAME).expect("valid");
         assert_eq!(draft.finish().expect("valid"), expected);
         assert_eq!(whole.finish().expect("valid"), expected);
@@ -221,7 +205,7 @@ mod tests {
     #[test]
     fn an_endless_stream_is_refused_as_soon_as_it_is_above_the_limits() {
         let limits = Limits { max_observations: 10, ..Limits::default() };
-        let mut draft = Draft::begin(Some(Inline::TrackSet(to_wire(raw(4)).head())), &limits).expect("a head");
+        let mut draft = Draft::begin(Some(Data::TrackSet(to_wire(raw(4)).head())), &limits).expect("a head");
         let chunk = proto::TrackSetChunk { ys: vec![0.0; 6], ..Default::default() };
         draft.append(Message::TrackSetChunk(chunk.clone())).expect("a chunk");
         assert_eq!(draft.check_size(), Ok(()));
@@ -233,7 +217,7 @@ mod tests {
     #[test]
     fn a_chunk_of_the_other_kind_is_refused() {
         let limits = Limits::default();
-        let mut draft = Draft::begin(Some(Inline::TrackSet(to_wire(raw(4)).head())), &limits).expect("a head");
+        let mut draft = Draft::begin(Some(Data::TrackSet(to_wire(raw(4)).head())), &limits).expect("a head");
         let error = draft.append(Message::MeasurementMatrixChunk(Default::default())).expect_err("another kind");
         assert_eq!(error.to_string(), "measurement_matrix_chunk: the config holds a track_set");
     }
@@ -242,7 +226,7 @@ mod tests {
     fn wrong_sigmas_name_their_index() {
         let mut set = to_wire(raw(4));
         set.sigmas_px = vec![1.0, 0.5, f64::NAN, 1.0];
-        let finish = |set| Draft::begin(Some(Inline::TrackSet(set)), &Limits::default()).expect("set").finish();
+        let finish = |set| Draft::begin(Some(Data::TrackSet(set)), &Limits::default()).expect("set").finish();
         let error = finish(set.clone()).expect_err("NaN");
         assert_eq!(error.violations()[0].path(), "track_set.sigmas_px[2]");
         set.sigmas_px = vec![1.0];

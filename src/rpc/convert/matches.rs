@@ -41,7 +41,7 @@ mod tests {
     use super::super::input_message::{CHUNK_ENTRIES, InputMessage};
     use super::*;
     use crate::domain::{Limits, View};
-    use crate::rpc::proto::create_job_request::Source as Inline;
+    use crate::rpc::proto::input_data::Data;
     use crate::rpc::proto::solve_request::Message;
 
     #[test]
@@ -59,7 +59,7 @@ mod tests {
         let limits = Limits::default();
         let set = to_wire(raw.clone());
         assert_eq!(to_raw(set.clone()), raw);
-        let mut draft = Draft::begin(Some(Inline::MatchSet(set.head())), &limits).expect("a head");
+        let mut draft = Draft::begin(Some(Data::MatchSet(set.head())), &limits).expect("a head");
         let mut count = 0;
         while let Some(chunk) = set.chunk(count) {
             draft.append(Message::MatchSetChunk(chunk)).expect("a chunk");
@@ -68,7 +68,7 @@ mod tests {
         }
         // Both views' keypoints are in one array.
         assert_eq!(count, 3);
-        let whole = Draft::begin(Some(Inline::MatchSet(set)), &limits).expect("a whole").finish().expect("valid");
+        let whole = Draft::begin(Some(Data::MatchSet(set)), &limits).expect("a whole").finish().expect("valid");
         assert_eq!(whole.joined_tracks().map(|joined| joined.joining.match_count), Some(keypoints));
         assert_eq!(draft.finish().expect("valid"), whole);
     }
@@ -76,7 +76,7 @@ mod tests {
     #[test]
     fn an_endless_stream_is_refused_as_soon_as_it_is_above_the_limits() {
         let limits = Limits { max_observations: 10, ..Limits::default() };
-        let mut draft = Draft::begin(Some(Inline::MatchSet(proto::MatchSet::default())), &limits).expect("a head");
+        let mut draft = Draft::begin(Some(Data::MatchSet(proto::MatchSet::default())), &limits).expect("a head");
         let chunk = proto::MatchSetChunk { second_keypoint_indices: vec![0; 6], ..Default::default() };
         draft.append(Message::MatchSetChunk(chunk.clone())).expect("a chunk");
         assert_eq!(draft.check_size(), Ok(()));

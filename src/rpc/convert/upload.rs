@@ -2,13 +2,13 @@
 //! the bytes say: prost's own decoding would take fifteen times their length for the worst of them.
 
 use prost::bytes::Buf;
-use prost::encoding::{DecodeContext, WireType, decode_key, decode_varint, skip_field};
+use prost::encoding::WireType::LengthDelimited;
+use prost::encoding::{DecodeContext, decode_key, decode_varint, skip_field};
 
 use super::input::Draft;
 use super::input_message::{Array, InputMessage};
 use crate::domain::{InvalidInput, Limits, Violation};
-use crate::rpc::proto;
-use proto::create_job_request::Source as Inline;
+use crate::rpc::proto::input_data::Data;
 
 /// Field of violations that are not of a field of the input.
 const DATA: &str = "data";
@@ -21,33 +21,26 @@ const DOUBLE_BYTES: usize = 8;
 /// # Errors
 /// A violation of `data` for bytes that are no such message, or of the first field that is too long.
 pub fn read(buf: &mut impl Buf, limits: &Limits) -> Result<Draft, InvalidInput> {
-    let mut body = None;
+    let mut data = None;
     while buf.has_remaining() {
         let (tag, wire) = decode_key(buf).map_err(malformed)?;
         // The last kind wins, and a kind that comes again is merged, as everywhere in protobuf.
-        body = match (tag, wire, body.take()) {
-            (1, WireType::LengthDelimited, before) => {
-                let before = if let Some(Inline::TrackSet(set)) = before { set } else { proto::TrackSet::default() };
-                Some(Inline::TrackSet(merged(buf, before, limits)?))
+        data = match (tag, wire, data.take()) {
+            (1, LengthDelimited, Some(Data::TrackSet(set))) => Some(Data::TrackSet(merged(buf, set, limits)?)),
+            (1, LengthDelimited, _) => Some(Data::TrackSet(merged(buf, Default::default(), limits)?)),
+            (2, LengthDelimited, Some(Data::MeasurementMatrix(matrix))) => {
+                Some(Data::MeasurementMatrix(merged(buf, matrix, limits)?))
             }
-            (2, WireType::LengthDelimited, before) => {
-                let before = match before {
-                    Some(Inline::MeasurementMatrix(matrix)) => matrix,
-                    _ => proto::MeasurementMatrix::default(),
-                };
-                Some(Inline::MeasurementMatrix(merged(buf, before, limits)?))
-            }
-            (3, WireType::LengthDelimited, before) => {
-                let before = if let Some(Inline::MatchSet(set)) = before { set } else { proto::MatchSet::default() };
-                Some(Inline::MatchSet(merged(buf, before, limits)?))
-            }
+            (2, LengthDelimited, _) => Some(Data::MeasurementMatrix(merged(buf, Default::default(), limits)?)),
+            (3, LengthDelimited, Some(Data::MatchSet(set))) => Some(Data::MatchSet(merged(buf, set, limits)?)),
+            (3, LengthDelimited, _) => Some(Data::MatchSet(merged(buf, Default::default(), limits)?)),
             (_, _, before) => {
                 skip_field(wire, tag, buf, DecodeContext::default()).map_err(malformed)?;
                 before
             }
         };
     }
-    let draft = Draft::begin(body, limits)?;
+    let draft = Draft::begin(data, limits)?;
     draft.check_size()?;
     Ok(draft)
 }
@@ -71,7 +64,7 @@ fn merged<S: InputMessage>(buf: &mut impl Buf, mut set: S, limits: &Limits) -> R
     let end = buf.remaining() - length;
     while buf.remaining() > end {
         let (tag, wire) = decode_key(buf).map_err(malformed)?;
-        match set.array(tag, limits).filter(|_| wire == WireType::LengthDelimited) {
+        match set.array(tag, limits).filter(|_| wire == LengthDelimited) {
             Some((name, array, max)) => decode_array(buf, array, &format!("{}.{name}", S::NAME), max)?,
             None => {
                 set.merge_field(tag, wire, buf, DecodeContext::default()).map_err(malformed)?;
@@ -137,6 +130,7 @@ mod tests {
 
     use super::*;
     use crate::domain::RawInput;
+    use crate::rpc::proto;
 
     fn limits() -> Limits {
         Limits { max_views: 3, max_tracks: 100, max_observations: 10 }
@@ -170,12 +164,12 @@ mod tests {
         }
     }
 
-    fn encoded(data: proto::input_data::Data) -> Vec<u8> {
+    fn encoded(data: Data) -> Vec<u8> {
         proto::InputData { data: Some(data) }.encode_to_vec()
     }
 
     fn track_set(observations: u32) -> Vec<u8> {
-        encoded(proto::input_data::Data::TrackSet(super::super::input::to_wire(raw(observations))))
+        encoded(Data::TrackSet(super::super::input::to_wire(raw(observations))))
     }
 
     #[test]
@@ -194,14 +188,14 @@ mod tests {
             visibility: vec![1; 6],
             ..Default::default()
         };
-        let whole = Draft::begin(Some(Inline::MeasurementMatrix(matrix.clone())), &limits()).expect("a matrix");
-        let bytes = encoded(proto::input_data::Data::MeasurementMatrix(matrix));
+        let whole = Draft::begin(Some(Data::MeasurementMatrix(matrix.clone())), &limits()).expect("a matrix");
+        let bytes = encoded(Data::MeasurementMatrix(matrix));
         let draft = read(&mut bytes.as_slice(), &limits()).expect("within the limits");
         assert_eq!(draft.finish().expect("valid"), whole.finish().expect("valid"));
-        let whole = Draft::begin(Some(Inline::MatchSet(match_set())), &limits()).expect("matches").finish();
+        let whole = Draft::begin(Some(Data::MatchSet(match_set())), &limits()).expect("matches").finish();
         let expected = whole.expect("valid");
         assert_eq!((expected.track_count(), expected.observation_count()), (1, 3));
-        let bytes = encoded(proto::input_data::Data::MatchSet(match_set()));
+        let bytes = encoded(Data::MatchSet(match_set()));
         for cut in 1..bytes.len() {
             let mut buf = bytes[..cut].chain(&bytes[cut..]);
             let draft = read(&mut buf, &limits()).expect("within the limits");
@@ -215,7 +209,7 @@ mod tests {
         let (bytes, unknown) = (track_set(4), [0x7a, 2, 1, 1]);
         let twice = [&bytes[..], &unknown, &bytes[..]].concat();
         let mut merged = proto::InputData::decode(twice.as_slice()).expect("decodes");
-        let Some(proto::input_data::Data::TrackSet(set)) = merged.data.take() else { panic!("no track set") };
+        let Some(Data::TrackSet(set)) = merged.data.take() else { panic!("no track set") };
         assert_eq!((set.xs.len(), set.views.len()), (8, 4));
         let error = read(&mut twice.as_slice(), &limits()).expect_err("four views");
         assert_eq!(error.violations()[0].field, "track_set.views");
@@ -257,7 +251,7 @@ mod tests {
 
     #[test]
     fn what_is_no_input_is_told_and_panics_nowhere() {
-        for bytes in [track_set(10), encoded(proto::input_data::Data::MatchSet(match_set()))] {
+        for bytes in [track_set(10), encoded(Data::MatchSet(match_set()))] {
             for cut in 0..bytes.len() {
                 let outcome = read(&mut &bytes[..cut], &limits());
                 assert!(outcome.is_err(), "cut at {cut}");

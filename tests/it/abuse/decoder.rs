@@ -5,6 +5,7 @@ use scpsfm::domain::{Input, InvalidInput, Limits};
 use scpsfm::rpc::convert::{create, input::Draft, list, names, upload};
 use scpsfm::rpc::proto;
 use scpsfm::rpc::proto::create_job_request::Source as Inline;
+use scpsfm::rpc::proto::input_data::Data;
 
 use crate::support::memory::peak_mb;
 use crate::support::mutation;
@@ -36,11 +37,17 @@ fn creation(bytes: &[u8]) -> Outcome {
     let checked = || {
         names::tenant(&request.parent, "default")?;
         create::from_wire(request.job_id, request.request_id, request.job)?;
-        if let Some(Inline::Input(name)) = &request.source {
-            names::input(name, "input", "default")?;
-            return Ok(None);
-        }
-        let draft = Draft::begin(request.source, &limits())?;
+        let data = match request.source {
+            Some(Inline::Input(name)) => {
+                names::input(&name, "input", "default")?;
+                return Ok(None);
+            }
+            Some(Inline::TrackSet(set)) => Some(Data::TrackSet(set)),
+            Some(Inline::MeasurementMatrix(matrix)) => Some(Data::MeasurementMatrix(matrix)),
+            Some(Inline::MatchSet(set)) => Some(Data::MatchSet(set)),
+            None => None,
+        };
+        let draft = Draft::begin(data, &limits())?;
         draft.check_size()?;
         draft.finish().map(Some)
     };
