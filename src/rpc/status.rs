@@ -94,7 +94,7 @@ fn status_with(
     Status::with_error_details(code, message, details)
 }
 
-/// A request that is refused before it becomes a call.
+/// A refusal that has its reason, and no details.
 pub fn refused(code: Code, reason: &str, message: impl Into<String>) -> Status {
     status(code, reason, message, ErrorDetails::new())
 }
@@ -173,19 +173,19 @@ pub fn tenant_not_found(tenant: &str) -> Status {
 /// A call without a key, or without one that could be read.
 pub fn no_key() -> Status {
     let message = "this server asks for an API key: send it as `authorization: Bearer KEY`";
-    status(Code::Unauthenticated, "API_KEY_MISSING", message, ErrorDetails::new())
+    refused(Code::Unauthenticated, "API_KEY_MISSING", message)
 }
 
 /// A key that is none here. Says nothing of the key.
 pub fn unknown_key() -> Status {
     let message = "the API key is not known here: it is mistyped, or was withdrawn";
-    status(Code::Unauthenticated, "API_KEY_UNKNOWN", message, ErrorDetails::new())
+    refused(Code::Unauthenticated, "API_KEY_UNKNOWN", message)
 }
 
 /// A key that was withdrawn while a call lasted.
 pub fn withdrawn_key() -> Status {
     let message = "the API key was withdrawn while the call lasted";
-    status(Code::Unauthenticated, "API_KEY_WITHDRAWN", message, ErrorDetails::new())
+    refused(Code::Unauthenticated, "API_KEY_WITHDRAWN", message)
 }
 
 /// A call that the scope of its key does not allow.
@@ -215,7 +215,7 @@ pub fn chunk_corrupted(offset: u64, told: u32, found: u32) -> Status {
 pub fn hash_mismatch(told: [u8; 32], found: [u8; 32]) -> Status {
     let (told, found) = (Sha256Digest(told), Sha256Digest(found));
     let message = format!("finish.sha256: the bytes have the SHA-256 {found}, not {told}; the upload is given up");
-    status(Code::DataLoss, "HASH_MISMATCH", message, ErrorDetails::new())
+    refused(Code::DataLoss, "HASH_MISMATCH", message)
 }
 
 /// The calls under way hold as many bytes as they may, this one's included.
@@ -235,7 +235,7 @@ pub fn rate_limited(bound: RateBound, wait: Duration) -> Status {
 /// The messages of a `Solve` or of an upload stopped coming.
 pub fn input_stalled(timeout: Duration) -> Status {
     let message = format!("no message arrived for {} s and the input is not complete", timeout.as_secs());
-    status(Code::DeadlineExceeded, "INPUT_STALLED", message, ErrorDetails::new())
+    refused(Code::DeadlineExceeded, "INPUT_STALLED", message)
 }
 
 /// What the transport says of a message that it did not take, with a reason; `None` for any other status.
@@ -248,13 +248,13 @@ pub fn from_transport(found: &Status) -> Option<Status> {
         Code::Internal => (Code::InvalidArgument, "MALFORMED_MESSAGE"),
         _ => return None,
     };
-    Some(status(code, reason, found.message(), ErrorDetails::new()))
+    Some(refused(code, reason, found.message()))
 }
 
 /// A defect of ours. The caller gets no inside view; the log has it.
 pub fn internal(error: &dyn std::fmt::Display) -> Status {
     tracing::error!(%error, "internal error");
-    status(Code::Internal, "INTERNAL", "internal error; the server's log has the cause", ErrorDetails::new())
+    refused(Code::Internal, "INTERNAL", "internal error; the server's log has the cause")
 }
 
 impl From<engine::Error> for Status {
@@ -271,7 +271,7 @@ impl From<engine::Error> for Status {
                     }
                     _ => format!("the job is {}; it has no result", state.name()),
                 };
-                status(Code::FailedPrecondition, "RESULT_NOT_READY", message, ErrorDetails::new())
+                refused(Code::FailedPrecondition, "RESULT_NOT_READY", message)
             }
             engine::Error::Draining => {
                 let details = ErrorDetails::with_retry_info(Some(DRAINING_RETRY));
@@ -292,13 +292,13 @@ pub fn of_batch(error: engine::Error) -> Status {
 
 /// What the store refuses.
 fn of_store(error: StoreError) -> Status {
-    let told = |code, reason| status(code, reason, error.to_string(), ErrorDetails::new());
+    let told = |code, reason| refused(code, reason, error.to_string());
     match &error {
         StoreError::NotFound(name) => job_not_found(name),
         StoreError::InputNotFound(name) => input_not_found(name),
         StoreError::UploadNotFound(name) => {
             let message = format!("there is no upload {}: it was never begun, or was given up", name.input);
-            status(Code::NotFound, "UPLOAD_NOT_FOUND", message, ErrorDetails::new())
+            refused(Code::NotFound, "UPLOAD_NOT_FOUND", message)
         }
         StoreError::UploadTakenOver(_) => told(Code::Aborted, "UPLOAD_TAKEN_OVER"),
         StoreError::UploadsFull(bound) => full("UPLOADS_FULL", bound, UPLOADS_RETRY),
