@@ -375,14 +375,13 @@ impl JobExecution {
     /// The job, where it stands as this attempt wanted to leave it.
     async fn committed(&self, ending: Option<&Ending>) -> Option<Job> {
         let job = self.inner.store.job(&self.lease.name).await.ok()?;
-        let (state, failure) = match &ending?.outcome {
-            Outcome::Succeeded { .. } => (JobState::Succeeded, None),
-            Outcome::Failed(failure) => (JobState::Failed, Some(failure)),
-            Outcome::Cancelled => (JobState::Cancelled, None),
-            Outcome::DeadlineExceeded => (JobState::DeadlineExceeded, None),
+        let outcome = &ending?.outcome;
+        let failure = match outcome {
+            Outcome::Failed(failure) => Some(failure),
+            _ => None,
         };
-        let ours = job.attempt == self.lease.attempt && job.state == state && job.failure.as_ref() == failure;
-        ours.then_some(job)
+        let is_ours = job.attempt == self.lease.attempt && job.state == outcome.state();
+        (is_ours && job.failure.as_ref() == failure).then_some(job)
     }
 
     fn announce(mut self, committed: Option<Job>) {

@@ -71,9 +71,7 @@ impl Jobs {
         }
         Ok(news)
     }
-}
 
-impl Jobs {
     /// The encoded result of a job, charged to the permit.
     ///
     /// * `largest`: a result of more bytes is refused
@@ -209,7 +207,7 @@ impl proto::job_service_server::JobService for Jobs {
     async fn cancel_job(&self, request: Request<proto::CancelJobRequest>) -> Result<Response<proto::Job>, Status> {
         let caller = Caller::of(&request)?;
         let name = caller.job(&request.get_ref().name)?;
-        let etag = Some(request.into_inner().etag).filter(|etag| !etag.is_empty());
+        let etag = convert::given(request.into_inner().etag);
         let (engine, resource) = (self.engine.clone(), name.clone());
         let cancel = async move { engine.cancel(&name, etag).await };
         let cancelled = caller.audited("CancelJob", resource, cancel).await?;
@@ -219,7 +217,7 @@ impl proto::job_service_server::JobService for Jobs {
     async fn delete_job(&self, request: Request<proto::DeleteJobRequest>) -> Result<Response<()>, Status> {
         let caller = Caller::of(&request)?;
         let name = caller.job(&request.get_ref().name)?;
-        let etag = Some(request.into_inner().etag).filter(|etag| !etag.is_empty());
+        let etag = convert::given(request.into_inner().etag);
         let (engine, resource) = (self.engine.clone(), name.clone());
         let delete = async move { engine.delete(&name, etag.as_deref()).await };
         caller.audited("DeleteJob", resource, delete).await.map(Response::new)
@@ -228,7 +226,7 @@ impl proto::job_service_server::JobService for Jobs {
     async fn retry_job(&self, request: Request<proto::RetryJobRequest>) -> Result<Response<proto::Job>, Status> {
         let caller = Caller::of(&request)?;
         let name = caller.job(&request.get_ref().name)?;
-        let etag = Some(request.into_inner().etag).filter(|etag| !etag.is_empty());
+        let etag = convert::given(request.into_inner().etag);
         let (engine, resource) = (self.engine.clone(), name.clone());
         let counted = caller.count_jobs(1);
         let retry = async move {
@@ -249,7 +247,7 @@ impl proto::job_service_server::JobService for Jobs {
         let checked = convert::required(priority, "priority")
             .and_then(|priority| create::check_priority(priority, "priority").map(|()| priority));
         let priority = checked.map_err(status::invalid)?;
-        let etag = Some(etag).filter(|etag| !etag.is_empty());
+        let etag = convert::given(etag);
         let (engine, resource) = (self.engine.clone(), name.clone());
         let change = async move { engine.set_priority(&name, etag.as_deref(), priority).await };
         let changed = caller.audited("SetJobPriority", resource, change).await?;

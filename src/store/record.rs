@@ -240,6 +240,18 @@ pub enum Outcome {
     DeadlineExceeded,
 }
 
+impl Outcome {
+    /// The state that the job ends in.
+    pub fn state(&self) -> JobState {
+        match self {
+            Self::Succeeded { .. } => JobState::Succeeded,
+            Self::Failed(_) => JobState::Failed,
+            Self::Cancelled => JobState::Cancelled,
+            Self::DeadlineExceeded => JobState::DeadlineExceeded,
+        }
+    }
+}
+
 /// The queue as its administrator sees it.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct QueueReport {

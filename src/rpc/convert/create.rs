@@ -2,7 +2,7 @@
 
 use std::collections::BTreeMap;
 
-use super::{positive_duration, settings, time_from_wire};
+use super::{given, positive_duration, settings, time_from_wire};
 use crate::domain::error::Violations;
 use crate::domain::{InvalidInput, SolveSettings, Violation, Webhook};
 use crate::engine::Deadline;
@@ -53,7 +53,6 @@ pub fn from_wire(job_id: String, request_id: String, job: Option<proto::Job>) ->
         found.push(Violation::of("job.webhook.url", error));
     }
     found.into_result()?;
-    let given = |id: String| (!id.is_empty()).then_some(id);
     Ok(Description {
         job_id: given(job_id),
         request_id: given(request_id),

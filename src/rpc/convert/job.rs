@@ -5,7 +5,7 @@ use std::collections::BTreeMap;
 use super::enums::{Twin, optional_to_wire};
 use super::time::{duration_to_wire, seconds_from_wire};
 use super::{
-    optional_time, progress, required, result, settings, size_from_wire, size_to_wire, tellable, time_from_wire,
+    given, optional_time, progress, required, result, settings, size_from_wire, size_to_wire, tellable, time_from_wire,
 };
 use crate::domain::job::{AttemptEnd, EventBody, Failure, Job, JobEvent, JobName, JobState, PastAttempt, Summary};
 use crate::domain::{Grade, InputName, InvalidInput, Proposal, Status, Violation, Webhook, WebhookState};
@@ -148,7 +148,7 @@ fn webhook_from_wire(webhook: proto::Webhook) -> Result<Webhook, Violation> {
         url: webhook.url,
         state: WebhookState::required(webhook.state, "webhook.state")?,
         attempts: webhook.attempt_count,
-        last_error: Some(webhook.last_error).filter(|error| !error.is_empty()),
+        last_error: given(webhook.last_error),
     })
 }
 

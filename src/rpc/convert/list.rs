@@ -46,7 +46,7 @@ pub fn from_wire(tenant: String, request: proto::ListJobsRequest) -> Result<Opti
         order,
         // Larger wishes are cut (AIP-158).
         page_size: request.page_size.unsigned_abs().min(JobQuery::MAX_PAGE_SIZE),
-        page_token: (!request.page_token.is_empty()).then_some(request.page_token),
+        page_token: super::given(request.page_token),
     }))
 }
 

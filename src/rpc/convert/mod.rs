@@ -40,6 +40,11 @@ pub fn count_to_wire(count: u64) -> u32 {
     u32::try_from(count).unwrap_or(u32::MAX)
 }
 
+/// A text that may be left out, which on the wire is an empty one.
+pub fn given(text: String) -> Option<String> {
+    (!text.is_empty()).then_some(text)
+}
+
 /// The field's value, or the violation that it is not set.
 pub(crate) fn required<T>(value: Option<T>, field: &str) -> Result<T, Violation> {
     value.ok_or_else(|| Violation::of(field, "is not set"))

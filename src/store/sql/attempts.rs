@@ -64,26 +64,21 @@ impl dyn Database {
         };
         writes!(self, "finish", Size::Outcome, Ends(bytes), [lease, ending], |connection| {
             let job = connection.held(&lease).await?;
-            let mut transition = match &ending.outcome {
+            let mut transition = Transition::to(ending.outcome.state());
+            transition.progress = ending.progress.as_ref();
+            transition.attempt_end = Some(AttemptEnd::Ended);
+            match &ending.outcome {
                 Outcome::Succeeded { summary, result } => {
                     for (chunk, data) in (0_i64..).zip(result.bytes.chunks(payload::CHUNK_BYTES)) {
                         let insert = "INSERT INTO result_chunks (job_id, chunk, data) VALUES ($1, $2, $3)";
                         connection.execute(Statement::new(insert).bind(job.id).bind(chunk).bind(data)).await?;
                     }
-                    Transition {
-                        summary: Some(summary),
-                        result_sha256: Some(&result.sha256),
-                        ..Transition::to(JobState::Succeeded)
-                    }
+                    transition.summary = Some(summary);
+                    transition.result_sha256 = Some(&result.sha256);
                 }
-                Outcome::Failed(failure) => {
-                    Transition { failure: Some(failure.clone()), ..Transition::to(JobState::Failed) }
-                }
-                Outcome::Cancelled => Transition::to(JobState::Cancelled),
-                Outcome::DeadlineExceeded => Transition::to(JobState::DeadlineExceeded),
-            };
-            transition.progress = ending.progress.as_ref();
-            transition.attempt_end = Some(AttemptEnd::Ended);
+                Outcome::Failed(failure) => transition.failure = Some(failure.clone()),
+                Outcome::Cancelled | Outcome::DeadlineExceeded => {}
+            }
             connection.transition(&job, transition, now).await
         })
     }

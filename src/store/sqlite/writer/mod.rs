@@ -80,7 +80,6 @@ impl Writer {
         operation: Operation<WriteConnection, ()>,
     ) -> Result<(), Error> {
         let (pending, turn, mut answer) = Pending::new(intent, operation);
-        let closed = || Error::Unavailable("the store is closed".into());
         self.inbox.send(Message::Write(pending)).map_err(|_| closed())?;
         loop {
             match timeout(self.turn_timeout, &mut answer).await {
@@ -129,11 +128,14 @@ impl Writer {
 
     /// Has something done that answers when it is.
     async fn send<T>(&self, message: fn(oneshot::Sender<T>) -> Message) -> Result<T, Error> {
-        let closed = || Error::Unavailable("the store is closed".into());
         let (done, answer) = oneshot::channel();
         self.inbox.send(message(done)).map_err(|_| closed())?;
         answer.await.map_err(|_| closed())
     }
+}
+
+fn closed() -> Error {
+    Error::Unavailable("the store is closed".into())
 }
 
 fn no_turn(turn_timeout: Duration) -> Error {
