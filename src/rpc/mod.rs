@@ -11,6 +11,7 @@ pub mod call;
 pub mod caller;
 pub mod convert;
 pub mod disconnect;
+mod health;
 pub mod inflight;
 pub mod inputs;
 pub mod jobs;

@@ -6,17 +6,15 @@ use std::time::Duration;
 
 use governor::clock::DefaultClock;
 use tokio::net::TcpListener;
-use tokio::sync::{Mutex, watch};
-use tokio::task::{JoinError, JoinHandle};
+use tokio::task::JoinError;
 use tokio_rustls::rustls::ServerConfig;
 use tokio_util::sync::CancellationToken;
+use tokio_util::task::AbortOnDropHandle;
 use tonic::Status;
 use tonic::codec::CompressionEncoding::Gzip;
 use tonic::codegen::http::HeaderMap;
 use tonic::service::Routes;
 use tonic::transport::server::Router;
-use tonic_health::ServingStatus;
-use tonic_health::server::HealthReporter;
 use tower::Layer;
 use tower::layer::util::{Identity, Stack};
 
@@ -26,6 +24,7 @@ use super::auth::Authenticate;
 use super::calibration::{self, Calibration};
 use super::call::{CallLayer, CallService};
 use super::caller::Tenant;
+use super::health::Health;
 use super::inflight::{Budget, Permit};
 use super::inputs::{self, Inputs};
 use super::jobs::Jobs;
@@ -40,12 +39,8 @@ use super::rates::{self, Rates};
 use super::reload::{self, Current};
 use super::tls;
 use crate::domain::Limits;
-use crate::engine::{Engine, StoreState};
+use crate::engine::Engine;
 use crate::telemetry::metrics::{Reloaded, locked_out};
-
-/// Services whose health is reported one by one; the empty name is the server's own.
-const HEALTH_NAMES: [&str; 5] =
-    ["", "scpsfm.v1.CalibrationService", "scpsfm.v1.JobService", "scpsfm.v1.InputService", "scpsfm.v1.AdminService"];
 
 /// Calls open at once on one connection: some hundred watchers and room for the rest. More wait on the client's side.
 const MAX_STREAMS_PER_CONNECTION: u32 = 1_024;
@@ -174,10 +169,10 @@ pub struct Server {
     key_count: Option<usize>,
     gateway: Gateway,
     health: Arc<Health>,
-    /// Follows the store; ended with the server.
-    store_task: JoinHandle<()>,
+    /// Has health follow the store.
+    _store_task: AbortOnDropHandle<()>,
     stop: CancellationToken,
-    task: JoinHandle<Result<(), tonic::transport::Error>>,
+    task: AbortOnDropHandle<Result<(), tonic::transport::Error>>,
 }
 
 impl Server {
@@ -200,9 +195,10 @@ impl Server {
         let listener = TcpListener::bind(options.listen).await.map_err(listen_error)?;
         let address = listener.local_addr().map_err(listen_error)?;
         let (reporter, health_service) = tonic_health::server::health_reporter();
-        let health = Arc::new(Health { reporter, draining: Mutex::new(false) });
+        let health = Arc::new(Health::new(reporter));
         let mut store = engine.store_state();
-        health.set_serving(is_of_use(*store.borrow_and_update())).await;
+        let state = *store.borrow_and_update();
+        health.set_store(state).await;
         let services = services(&options, engine)?;
         let listener_options = listener::Options {
             certificates,
@@ -223,8 +219,17 @@ impl Server {
         let stopped = stop.clone().cancelled_owned();
         let incoming = Listener::new(listener, listener_options).into_stream();
         let task = tokio::spawn(router.serve_with_incoming_shutdown(incoming, stopped));
-        let store_task = tokio::spawn(follow_store(Arc::clone(&health), store));
-        Ok(Self { address, key_count, gateway, health, store_task, stop, task })
+        let followed = Arc::clone(&health);
+        let store_task = tokio::spawn(async move { followed.follow(store).await });
+        Ok(Self {
+            address,
+            key_count,
+            gateway,
+            health,
+            _store_task: AbortOnDropHandle::new(store_task),
+            stop,
+            task: AbortOnDropHandle::new(task),
+        })
     }
 
     /// Where the server listens.
@@ -271,56 +276,6 @@ impl Server {
             }
         }
     }
-}
-
-impl Drop for Server {
-    fn drop(&mut self) {
-        self.task.abort();
-        self.store_task.abort();
-    }
-}
-
-/// What health checks are answered.
-#[derive(Debug)]
-struct Health {
-    reporter: HealthReporter,
-    /// Held while the statuses change, so that a store that comes back does not undo a drain.
-    draining: Mutex<bool>,
-}
-
-impl Health {
-    /// Tells whether calls can be answered; while the server drains, nothing changes.
-    async fn set_serving(&self, serving: bool) {
-        let draining = self.draining.lock().await;
-        if !*draining {
-            self.set(if serving { ServingStatus::Serving } else { ServingStatus::NotServing }).await;
-        }
-    }
-
-    async fn drain(&self) {
-        let mut draining = self.draining.lock().await;
-        *draining = true;
-        self.set(ServingStatus::NotServing).await;
-    }
-
-    async fn set(&self, status: ServingStatus) {
-        for name in HEALTH_NAMES {
-            self.reporter.set_service_status(name, status).await;
-        }
-    }
-}
-
-/// Tells health checks NOT_SERVING while the store is out of reach.
-async fn follow_store(health: Arc<Health>, mut store: watch::Receiver<StoreState>) {
-    while store.changed().await.is_ok() {
-        let state = *store.borrow_and_update();
-        health.set_serving(is_of_use(state)).await;
-    }
-}
-
-/// Whether anyone should call a server whose store is so: on one that is full results are read, and room is made.
-fn is_of_use(store: StoreState) -> bool {
-    store != StoreState::Unavailable
 }
 
 /// The certificates, followed as their files change.
