@@ -129,11 +129,6 @@ impl KeyRing {
         self
     }
 
-    /// The tenant that a key stands for.
-    pub fn tenant_of(&self, key: &str) -> Option<&str> {
-        self.grant_of_hash(&Hash::of(key)).map(|grant| grant.tenant.as_str())
-    }
-
     /// What the key of this hash stands for. Compares with every key, each to its last byte, so that the time tells
     /// nothing.
     pub fn grant_of_hash(&self, key: &Hash) -> Option<&Grant> {
@@ -276,6 +271,13 @@ mod tests {
 
     const A: &str = "aaaaaaaaaaaaaaaaaaaaaaaaaaaaaaaa";
     const B: &str = "bbbbbbbbbbbbbbbbbbbbbbbbbbbbbbbb";
+
+    impl KeyRing {
+        /// The tenant that a key stands for.
+        pub(crate) fn tenant_of(&self, key: &str) -> Option<&str> {
+            self.grant_of_hash(&Hash::of(key)).map(|grant| grant.tenant.as_str())
+        }
+    }
 
     #[test]
     fn a_key_stands_for_its_tenant_however_it_is_written() {
