@@ -18,6 +18,7 @@ pub mod result;
 mod second_structures;
 pub mod settings;
 mod time;
+mod tracks;
 pub mod upload;
 
 pub(crate) use time::{optional_time, positive_duration, tellable, time_from_wire};

@@ -4,14 +4,12 @@ use prost::Message;
 
 use super::enums::{Twin, optional_to_wire};
 use super::time::{duration_to_wire, seconds_from_wire};
-use super::{progress, required, second_structures};
+use super::{progress, required, second_structures, tracks};
 use crate::domain::job::JobName;
-use crate::domain::result::{
-    ObservationResults, ProposalTime, Sigmas, StageTime, TrackResults, TrackSplit, TwoViewTrack, ViewResult,
-};
+use crate::domain::result::{ProposalTime, Sigmas, StageTime, ViewResult};
 use crate::domain::{
-    Calibration, Grade, JoinedTracks, Joining, LeftOut, LensProjection, Method, Proposal, Sha256Digest, Solution,
-    Stage, Status, Violation, Warning, WarningCode,
+    Calibration, Grade, LeftOut, LensProjection, Method, Proposal, Sha256Digest, Solution, Stage, Status, Violation,
+    Warning, WarningCode,
 };
 use crate::rpc::proto;
 
@@ -33,10 +31,10 @@ fn to_wire(name: &JobName, solution: &Solution) -> proto::JobResult {
         calibrations: solution.calibrations.iter().map(calibration_to_wire).collect(),
         plane_at_infinity: solution.plane_at_infinity.map(|[x, y, z]| proto::PlaneAtInfinity { x, y, z }),
         views: solution.views.iter().map(view_to_wire).collect(),
-        tracks: Some(tracks_to_wire(&solution.tracks)),
-        observations: Some(observations_to_wire(&solution.observations)),
-        track_splits: solution.splits.iter().map(split_to_wire).collect(),
-        two_view_tracks: solution.two_view_tracks.iter().map(two_view_track_to_wire).collect(),
+        tracks: Some(tracks::to_wire(&solution.tracks)),
+        observations: Some(tracks::observations_to_wire(&solution.observations)),
+        track_splits: solution.splits.iter().map(tracks::split_to_wire).collect(),
+        two_view_tracks: solution.two_view_tracks.iter().map(tracks::two_view_track_to_wire).collect(),
         second_structures: solution.second_structures.iter().map(second_structures::to_wire).collect(),
         noise_px: solution.noise_px,
         reprojection_rms_px: solution.reprojection_rms_px,
@@ -63,14 +61,15 @@ fn to_wire(name: &JobName, solution: &Solution) -> proto::JobResult {
         progress_records: solution.history.iter().map(progress::to_wire).collect(),
         trained_network_sha256: digest_to_wire(solution.trained_network_sha256),
         input_content_sha256: digest_to_wire(solution.input_content_sha256),
-        joined_tracks: solution.joined_tracks.as_ref().map(joined_tracks_to_wire),
+        joined_tracks: solution.joined_tracks.as_ref().map(tracks::joined_tracks_to_wire),
     }
 }
 
 /// # Errors
 /// A violation that names the field which no server of this version would send.
 pub fn from_wire(result: proto::JobResult) -> Result<Solution, Violation> {
-    let tracks = tracks_from_wire(required(result.tracks, "tracks")?)?;
+    let track_results = tracks::from_wire(required(result.tracks, "tracks")?)?;
+    let track_count = track_results.weight.len();
     Ok(Solution {
         status: Status::required(result.status, "status")?,
         grade: Grade::from_wire(result.grade, "grade")?,
@@ -81,15 +80,11 @@ pub fn from_wire(result: proto::JobResult) -> Result<Solution, Violation> {
         calibrations: result.calibrations.iter().map(calibration_from_wire).collect::<Result<_, _>>()?,
         plane_at_infinity: result.plane_at_infinity.map(|plane| [plane.x, plane.y, plane.z]),
         views: result.views.iter().enumerate().map(view_from_wire).collect::<Result<_, _>>()?,
-        observations: observations_from_wire(required(result.observations, "observations")?)?,
-        splits: result.track_splits.iter().enumerate().map(split_from_wire).collect::<Result<_, _>>()?,
-        two_view_tracks: two_view_tracks_from_wire(&result.two_view_tracks, tracks.weight.len())?,
-        second_structures: second_structures::from_wire(
-            &result.second_structures,
-            result.views.len(),
-            tracks.weight.len(),
-        )?,
-        tracks,
+        observations: tracks::observations_from_wire(required(result.observations, "observations")?)?,
+        splits: result.track_splits.iter().enumerate().map(tracks::split_from_wire).collect::<Result<_, _>>()?,
+        two_view_tracks: tracks::two_view_tracks_from_wire(&result.two_view_tracks, track_count)?,
+        second_structures: second_structures::from_wire(&result.second_structures, result.views.len(), track_count)?,
+        tracks: track_results,
         noise_px: result.noise_px,
         reprojection_rms_px: result.reprojection_rms_px,
         reprojection_mean_px: result.reprojection_mean_px,
@@ -122,7 +117,7 @@ pub fn from_wire(result: proto::JobResult) -> Result<Solution, Violation> {
             .collect::<Result<_, _>>()?,
         trained_network_sha256: digest_from_wire(&result.trained_network_sha256, "trained_network_sha256")?,
         input_content_sha256: digest_from_wire(&result.input_content_sha256, "input_content_sha256")?,
-        joined_tracks: result.joined_tracks.map(joined_tracks_from_wire).transpose()?,
+        joined_tracks: result.joined_tracks.map(tracks::joined_tracks_from_wire).transpose()?,
     })
 }
 
@@ -278,171 +273,6 @@ pub(super) fn rows<const N: usize>(numbers: &[f64]) -> Result<Option<[[f64; N]; 
         return Err(());
     }
     Ok(Some(std::array::from_fn(|row| std::array::from_fn(|column| numbers[N * row + column]))))
-}
-
-/// Points are few among many tracks: they travel as indices and coordinates.
-fn tracks_to_wire(tracks: &TrackResults) -> proto::TrackResults {
-    let with_point = || tracks.point.iter().enumerate().filter_map(|(track, point)| Some((track, (*point)?)));
-    proto::TrackResults {
-        weights: tracks.weight.clone(),
-        inliers: tracks.inlier.clone(),
-        network_weights: tracks.network_weight.clone(),
-        point_track_indices: with_point().map(|(track, _)| track as u32).collect(),
-        points: with_point().flat_map(|(_, point)| point).collect(),
-        point_parts: if tracks.part.is_empty() {
-            Vec::new()
-        } else {
-            with_point().map(|(track, _)| tracks.part_of(track).unwrap_or(0)).collect()
-        },
-        second_structure_numbers: tracks.second_structure.clone(),
-    }
-}
-
-/// Checks the tracks that two views see against the number of all tracks.
-fn two_view_tracks_from_wire(found: &[proto::TwoViewTrack], count: usize) -> Result<Vec<TwoViewTrack>, Violation> {
-    let mut next = 0;
-    let track = |(index, found): (usize, &proto::TwoViewTrack)| {
-        let proto::TwoViewTrack { track_index: track, weight, part, ref point } = *found;
-        in_rising_order(track, &mut next, count, "track")
-            .map_err(|what| Violation::at("two_view_tracks.track_index", index, what))?;
-        let point = point_from_wire(point, "two_view_tracks.point", index)?;
-        Ok(TwoViewTrack { track, weight, part, point })
-    };
-    found.iter().enumerate().map(track).collect()
-}
-
-/// Checks that an index is among the `count`, and from `next` on, which becomes the one after it; otherwise says so.
-pub(super) fn in_rising_order(index: u32, next: &mut usize, count: usize, what: &str) -> Result<(), String> {
-    if !(*next..count).contains(&(index as usize)) {
-        return Err(format!("{what} {index} is not in rising order within the {count} {what}s"));
-    }
-    *next = index as usize + 1;
-    Ok(())
-}
-
-fn tracks_from_wire(tracks: proto::TrackResults) -> Result<TrackResults, Violation> {
-    let count = tracks.weights.len();
-    let is_of_all = |length: usize| length == 0 || length == count;
-    let are_of_all = is_of_all(tracks.network_weights.len()) && is_of_all(tracks.second_structure_numbers.len());
-    if tracks.inliers.len() != count || !are_of_all {
-        return Err(Violation::of("tracks", format!("arrays of different lengths beside {count} weights")));
-    }
-    if tracks.points.len() != 3 * tracks.point_track_indices.len() {
-        return Err(Violation::of(
-            "tracks.points",
-            format!("{} numbers for {} points", tracks.points.len(), tracks.point_track_indices.len()),
-        ));
-    }
-    let part_count = tracks.point_parts.len();
-    if part_count != 0 && part_count != tracks.point_track_indices.len() {
-        let what = format!("{part_count} parts for {} points", tracks.point_track_indices.len());
-        return Err(Violation::of("tracks.point_parts", what));
-    }
-    let mut point = vec![None; count];
-    let mut part = if part_count == 0 { Vec::new() } else { vec![0; count] };
-    for (index, (&track, xyz)) in tracks.point_track_indices.iter().zip(tracks.points.chunks_exact(3)).enumerate() {
-        let slot = point.get_mut(track as usize).ok_or_else(|| {
-            Violation::at("tracks.point_track_indices", index, format!("track {track} is outside the {count} tracks"))
-        })?;
-        *slot = Some([xyz[0], xyz[1], xyz[2]]);
-        if let (Some(part), Some(&of)) = (part.get_mut(track as usize), tracks.point_parts.get(index)) {
-            *part = of;
-        }
-    }
-    let proto::TrackResults { weights, inliers, network_weights, second_structure_numbers, .. } = tracks;
-    Ok(TrackResults {
-        weight: weights,
-        inlier: inliers,
-        network_weight: network_weights,
-        point,
-        part,
-        second_structure: second_structure_numbers,
-    })
-}
-
-fn observations_to_wire(observations: &ObservationResults) -> proto::ObservationResults {
-    proto::ObservationResults {
-        inliers: observations.inlier.clone(),
-        classified: observations.residual_px.iter().map(Option::is_some).collect(),
-        residuals_px: observations.residual_px.iter().map(|residual| residual.unwrap_or(0.0)).collect(),
-        weights: observations.weight.clone(),
-        split_numbers: if observations.split.iter().any(|&split| split > 0) {
-            observations.split.clone()
-        } else {
-            Vec::new()
-        },
-    }
-}
-
-fn split_to_wire(split: &TrackSplit) -> proto::TrackSplit {
-    let TrackSplit { track, number, weight, point } = *split;
-    proto::TrackSplit { track_index: track, number, weight, point: point.map_or_else(Vec::new, Vec::from) }
-}
-
-fn split_from_wire((index, split): (usize, &proto::TrackSplit)) -> Result<TrackSplit, Violation> {
-    let point = point_from_wire(&split.point, "track_splits.point", index)?;
-    Ok(TrackSplit { track: split.track_index, number: split.number, weight: split.weight, point })
-}
-
-fn two_view_track_to_wire(found: &TwoViewTrack) -> proto::TwoViewTrack {
-    let TwoViewTrack { track, weight, part, point } = *found;
-    proto::TwoViewTrack { track_index: track, weight, part, point: point.map_or_else(Vec::new, Vec::from) }
-}
-
-/// A point, or none at infinity.
-fn point_from_wire(numbers: &[f64], field: &'static str, index: usize) -> Result<Option<[f64; 3]>, Violation> {
-    if numbers.is_empty() {
-        return Ok(None);
-    }
-    three(numbers).map(Some).map_err(|what| Violation::at(field, index, what))
-}
-
-/// Three numbers, or what is wrong with them.
-pub(super) fn three(numbers: &[f64]) -> Result<[f64; 3], String> {
-    numbers.try_into().map_err(|_| format!("{} numbers instead of three", numbers.len()))
-}
-
-fn observations_from_wire(mut observations: proto::ObservationResults) -> Result<ObservationResults, Violation> {
-    let count = observations.inliers.len();
-    if observations.classified.len() != count || observations.residuals_px.len() != count {
-        return Err(Violation::of("observations", "arrays of different lengths"));
-    }
-    let lengths = [("weights", observations.weights.len()), ("split_numbers", observations.split_numbers.len())];
-    if let Some((name, length)) = lengths.into_iter().find(|(_, length)| ![0, count].contains(length)) {
-        return Err(Violation::of(
-            format!("observations.{name}"),
-            format!("{length} entries for {count} observations"),
-        ));
-    }
-    let residual_px = observations.classified.iter().zip(&observations.residuals_px);
-    // Both are left out where they say nothing.
-    observations.weights.resize(count, 0.0);
-    observations.split_numbers.resize(count, 0);
-    Ok(ObservationResults {
-        residual_px: residual_px.map(|(&classified, &residual)| classified.then_some(residual)).collect(),
-        weight: observations.weights,
-        split: observations.split_numbers,
-        inlier: observations.inliers,
-    })
-}
-
-fn joined_tracks_to_wire(joined: &JoinedTracks) -> proto::JoinedTracks {
-    proto::JoinedTracks {
-        view_indices: joined.view.clone(),
-        track_indices: joined.track.clone(),
-        keypoint_indices: joined.joining.keypoint.clone(),
-        match_count: joined.joining.match_count,
-        cut_match_count: joined.joining.cut_match_count,
-    }
-}
-
-fn joined_tracks_from_wire(joined: proto::JoinedTracks) -> Result<JoinedTracks, Violation> {
-    let proto::JoinedTracks { view_indices, track_indices, keypoint_indices, match_count, cut_match_count } = joined;
-    if view_indices.len() != keypoint_indices.len() || track_indices.len() != keypoint_indices.len() {
-        return Err(Violation::of("joined_tracks", "arrays of different lengths"));
-    }
-    let joining = Joining { keypoint: keypoint_indices, match_count, cut_match_count };
-    Ok(JoinedTracks { view: view_indices, track: track_indices, joining })
 }
 
 #[cfg(test)]

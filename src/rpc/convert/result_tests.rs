@@ -3,8 +3,10 @@
 use prost::Message;
 
 use super::*;
+use crate::domain::result::{ObservationResults, TrackResults, TrackSplit, TwoViewTrack};
 use crate::domain::second_structure::{SecondStructure, SecondStructureKind, StructurePoint, StructurePose};
 use crate::domain::{HeadProgress, LensProjection, Losses, Phase, Progress, ReconstructionProgress};
+use crate::domain::{JoinedTracks, Joining};
 
 fn name() -> JobName {
     JobName { tenant: "default".into(), job: "a".into() }

@@ -1,7 +1,8 @@
 //! Second structures of a result.
 
 use super::enums::{Twin, optional_to_wire};
-use super::result::{in_rising_order, rows, three};
+use super::result::rows;
+use super::tracks::{in_rising_order, three};
 use crate::domain::Violation;
 use crate::domain::second_structure::{SecondStructure, SecondStructureKind, StructurePoint, StructurePose};
 use crate::rpc::proto;
