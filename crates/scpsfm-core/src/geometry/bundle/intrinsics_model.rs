@@ -11,6 +11,8 @@ pub enum Extension {
     /// Each of the next two only with the one before: a later term of a series without the first means nothing.
     RadialK2,
     RadialK3,
+    /// Only with the first radial term: what is off centre distorts only where it would distort in the centre
+    /// (Brown 1966).
     Tangential,
 }
 
@@ -21,7 +23,7 @@ impl Extension {
     /// What must be free for this one to be.
     pub fn needs(self) -> Option<Extension> {
         match self {
-            Extension::RadialK2 => Some(Extension::RadialK1),
+            Extension::RadialK2 | Extension::Tangential => Some(Extension::RadialK1),
             Extension::RadialK3 => Some(Extension::RadialK2),
             _ => None,
         }
@@ -233,7 +235,7 @@ mod tests {
         );
         assert_eq!(IntrinsicsModel::FULL.parameters(), Parameter::ALL);
         for simplest in [IntrinsicsModel::FOCAL, IntrinsicsModel::FOCAL_PER_VIEW] {
-            assert_eq!(simplest.with_any_extensions().count(), 32);
+            assert_eq!(simplest.with_any_extensions().count(), 28);
             assert_eq!(simplest.with_any_extensions().next(), Some(simplest));
         }
         let own = IntrinsicsModel::FOCAL_PER_VIEW.with(Extension::RadialK1);
