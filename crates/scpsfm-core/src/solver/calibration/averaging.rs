@@ -1,9 +1,7 @@
 //! What not knowing the model costs: standard deviations averaged over models.
 
 use super::models::{Candidate, Choice, Selection};
-use crate::geometry::bundle::Options;
-use crate::geometry::bundle::metric::{Extension, Intrinsics, IntrinsicsModel, IntrinsicsPrior, Optimum, Parameter};
-use crate::geometry::bundle::sequence;
+use crate::geometry::bundle::metric::{Extension, IntrinsicsModel, IntrinsicsPrior, Optimum, Parameter};
 
 /// A model as the observations and what lenses are like weigh it.
 struct Weighed<'a> {
@@ -31,16 +29,15 @@ impl Choice<'_> {
     /// with distortion once for each kind of lens. An extension that the data can neither confirm nor refute thus costs
     /// what it would move.
     ///
-    /// * `inflation`: factor on all of them, for what the calibration does not fit
+    /// * `inflation`: factor on all of them, for what a linearisation with independent noise does not see
     pub fn sigmas(&self, selection: &Selection, inflation: f64) -> Sigmas {
         let best = &selection.best;
         let views = best.minimum.reconstruction.focals.len();
-        let own = best.sigma_log_focal().and_then(|own| Some((own, best.optimum(best.model, &best.priors)?)));
-        let Some((own, here)) = own else {
+        let here = best.sigma_log_focal().and_then(|_| best.optimum(best.model, &best.priors));
+        let Some(here) = here else {
             let of_group = vec![[None; Parameter::COUNT]; self.problem.groups()];
             return Sigmas { of_group, view_focals: vec![None; views] };
         };
-        let profiled = self.profiled(own, best);
         let unit = best.fit.noise.powi(2);
         let models: Vec<Weighed> =
             best.model.with_any_extensions().flat_map(|model| self.weighed(selection, model)).collect();
@@ -57,8 +54,7 @@ impl Choice<'_> {
                     None => {}
                 }
             }
-            // What the profile adds to the chosen model's own deviation, it adds to the whole.
-            Some(squared.sqrt() * profiled / own * inflation).filter(|sigma| sigma.is_finite())
+            Some(squared.sqrt() * inflation).filter(|sigma| sigma.is_finite())
         };
         let free = best.model.parameters();
         let of_parameter = |group: usize, parameter: Parameter| {
@@ -118,99 +114,5 @@ impl Choice<'_> {
             false => 0.0,
         };
         Extension::ALL.into_iter().map(of).sum()
-    }
-
-    /// The standard deviation as the profile of the cost shows it, where that is larger than the linearised one.
-    ///
-    /// The focal length, of several groups all in their ratios, is held three standard deviations away while everything
-    /// else adjusts; the chi-square should rise by nine. Near critical motions the linearisation is optimistic: it is
-    /// taken where the noise has moved the scene.
-    fn profiled(&self, sigma: f64, best: &Candidate) -> f64 {
-        let options = &self.problem.options.models;
-        let shift = (options.profile_deviations * sigma).min(options.profile_longest);
-        if shift <= 0.0 {
-            return sigma;
-        }
-        let model = best.model.without_focal();
-        let side = |shift: f64| {
-            let mut moved = best.minimum.reconstruction.clone();
-            moved.scale_focals(shift.exp());
-            let options = Options::squared(options.profile_iterations);
-            let report =
-                sequence::adjust_all(&mut moved, self.problem.observations, model, &best.priors, &options, self.stop);
-            let of_group = |(prior, intrinsics): (&IntrinsicsPrior, &Intrinsics)| {
-                let deviation = prior.deviation(Parameter::LogFocal, intrinsics);
-                prior.information[Parameter::LogFocal as usize] * deviation.powi(2)
-            };
-            let of_priors: f64 = best.priors.iter().zip(&moved.intrinsics).map(of_group).sum();
-            (report.cost + of_priors - best.minimum.cost).max(0.0) / best.fit.noise.powi(2)
-        };
-        let rise = side(shift).min(side(-shift));
-        sigma.max(shift / rise.sqrt().max(f64::MIN_POSITIVE))
-    }
-}
-
-#[cfg(test)]
-mod tests {
-    use nalgebra::Vector4;
-
-    use super::*;
-    use crate::domain::StopToken;
-    use crate::geometry::bundle::testing::{self, TestScene};
-    use crate::solver::calibration::options::CalibrationOptions;
-    use crate::solver::calibration::tests::of_one_lens;
-
-    const NOISE: f64 = 0.001;
-
-    /// A scene in which every track lives five views: what is far apart is held together by many weak links.
-    fn banded(seed: u64, views: usize) -> TestScene {
-        let mut scene = testing::scene(seed, views, 10 * views, NOISE);
-        let first = |point: usize| point % (views - 4);
-        scene.observations.retain(|seen| (first(seen.point)..first(seen.point) + 5).contains(&seen.view));
-        scene
-    }
-
-    /// The focal length held, everything else follows to the bottom of the valley, however long that takes.
-    #[test]
-    fn the_profile_is_taken_where_all_else_has_followed() {
-        let turning = [0.1, 0.02].into_iter().flat_map(|turning| {
-            (0..3).map(move |seed| {
-                (format!("turning {turning}, seed {seed}"), testing::scene_turning(seed, 40, NOISE, turning))
-            })
-        });
-        let banded = [10, 20, 40]
-            .into_iter()
-            .flat_map(|views| (0..3).map(move |seed| (format!("{views} views, seed {seed}"), banded(seed, views))));
-        let options = CalibrationOptions::DEFAULT.models;
-        let mut longest = 0;
-        for (case, scene) in turning.chain(banded) {
-            let points: Vec<Vector4<f64>> = scene.points.iter().map(|point| point.push(1.0)).collect();
-            let cameras = scene.cameras();
-            let problem = of_one_lens(&cameras, &points, &scene.observations, NOISE);
-            let (priors, stop) = (vec![problem.options.lenses.prior(NOISE, None, 1000.0)], StopToken::default());
-            let choice = Choice { problem: &problem, scale_px: 1000.0, stop: &stop };
-            let reconstruction = scene.reconstruction();
-            for model in [IntrinsicsModel::FOCAL, IntrinsicsModel::FULL] {
-                let minimum = choice.search(&priors).converged(reconstruction.clone(), model);
-                let best = Candidate::new(minimum, model, priors.clone(), &problem);
-                let sigma = best.sigma_log_focal().expect("observable");
-                let profiled = choice.profiled(sigma, &best);
-                let shift = (options.profile_deviations * sigma).min(options.profile_longest);
-                let mut rise = |shift: f64| {
-                    let mut moved = best.minimum.reconstruction.clone();
-                    moved.scale_focals(shift.exp());
-                    let options = Options { max_iterations: 5000, relative_tolerance: 1e-13, ..Options::default() };
-                    let model = model.without_focal();
-                    let report = sequence::adjust_all(&mut moved, &scene.observations, model, &priors, &options, &stop);
-                    longest = longest.max(report.iterations);
-                    (report.cost - best.minimum.cost) / best.fit.noise.powi(2)
-                };
-                let expected = sigma.max(shift / rise(shift).min(rise(-shift)).sqrt());
-                println!("{case}, {}: sigma {sigma:.5}, profiled {profiled:.5} for {expected:.5}", model.name());
-                assert!((profiled / expected - 1.0).abs() < 0.01, "{case}: {profiled} for {expected}");
-            }
-        }
-        println!("{longest} iterations at most");
-        assert!(longest < options.profile_iterations, "{longest} iterations");
     }
 }

@@ -35,7 +35,9 @@ pub(super) fn grade(
             Comparison::new(&choice.on_stretch(best, stretch.metric), fit, &choice).beside(&best.fit)
         }
     };
-    let sigmas = choice.sigmas(&selection, comparison.inflation);
+    let profile = choice.profile(best);
+    let comparison = Comparison { correlation: profile.correlation, ..comparison };
+    let sigmas = choice.sigmas(&selection, comparison.inflation() * profile.widening);
     let has_own_focals = best.minimum.reconstruction.has_own_focals();
     let mut focals = view_focals::of(best, &sigmas, lenses);
     let determined: Vec<bool> = focals.iter().map(|view| view_focals::is_determined(view, grades)).collect();
@@ -45,7 +47,7 @@ pub(super) fn grade(
     // differ by some tenths of a per cent too, behind a lens that the model does not quite have: only what the grade
     // depends on is said.
     let is_misfit = comparison.is_misfit(fit_options);
-    let differing = ((is_misfit || comparison.is_inflated(fit_options)) && !has_own_focals)
+    let differing = ((is_misfit || comparison.is_violated(fit_options)) && !has_own_focals)
         .then(|| view_focals::differing(&best.minimum.reconstruction, &best.fit, choice))
         .flatten()
         .filter(|differing| is_misfit || differing.shift > grades.metric_below);
@@ -87,7 +89,7 @@ pub(super) fn grade(
         }
         verdict.judge_cheirality(best.minimum.cheirality);
         if verdict.grade != Grade::ProjectiveOnly && !has_own_focals {
-            verdict.warnings.extend(principal_point(best, group, comparison.inflation, choice));
+            verdict.warnings.extend(principal_point(best, group, comparison.inflation(), choice));
         }
         let ratio = |sigma: Option<f64>| Some(sigma? / of_focal?).filter(|ratio| ratio.is_finite());
         Outcome {
@@ -211,7 +213,7 @@ fn weigh_prior(
     comparison: &Comparison,
     focal_prior: FocalPrior,
 ) {
-    let of_data = of_data(best, group, comparison.inflation);
+    let of_data = of_data(best, group, comparison.inflation());
     // It lifts the grade by one step at most.
     if of_data.is_none_or(|of_data| of_data > choice.problem.options.grades.weak_up_to) {
         verdict.grade = verdict.grade.worse(Grade::Weak);
@@ -234,7 +236,7 @@ fn weigh_prior(
     let focal_px = freed.minimum.reconstruction.intrinsics[group].focal * choice.scale_px;
     let Some(of_data) = freed.sigma(group, Parameter::LogFocal, freed.model, &freed.priors) else { return };
     // What is left of the misfit without the prior is not its doing.
-    let inflation = (comparison.inflation * freed.fit.noise / best.fit.noise).max(1.0);
+    let inflation = (comparison.inflation() * freed.fit.noise / best.fit.noise).max(1.0);
     if let Some(deviations) = contradicts((focal_px / focal_prior.focal_px).ln(), inflation * of_data) {
         let detail = format!(
             "the tracks alone give a focal length of {focal_px:.1} px, {deviations:.1} standard deviations from the \

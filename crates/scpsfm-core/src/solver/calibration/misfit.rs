@@ -6,6 +6,8 @@ use super::Uncalibrated;
 use super::fit::Fit;
 use super::models::{Candidate, Choice};
 use super::options::FitOptions;
+#[cfg(doc)]
+use super::profile::Profile;
 use crate::domain::StopToken;
 use crate::geometry::bundle::metric::{Extension, Intrinsics, IntrinsicsPrior, MetricReconstruction};
 use crate::geometry::bundle::sequence;
@@ -23,13 +25,15 @@ pub(super) struct Comparison {
     pub noise: f64,
     /// Whether chance does not explain a ratio above 1.
     pub is_significant: bool,
-    /// Factor on the standard deviations of the calibration (Birge's ratio), 1 where chance explains the misfit.
+    /// Factor by which the calibration is violated (Birge's ratio), 1 where chance explains the misfit.
     ///
     /// A calibration rests on the few constraints that it puts on a projective reconstruction. Where these are violated
     /// by more than the noise, whatever the reason, it is as much less certain: of four cameras that were taken for one
     /// (20 scenes), the focal lengths were off by 2.2 % in the median and 17 % at most at a sigma of .45 %, with
     /// residuals 2 to 25 % larger than projective ones and this ratio between 2.6 and 10.5.
-    pub inflation: f64,
+    pub violation: f64,
+    /// As [`Profile::correlation`].
+    pub correlation: f64,
 }
 
 impl Comparison {
@@ -39,8 +43,13 @@ impl Comparison {
     }
 
     /// Whether the data violate the calibration by so much that it is said.
-    pub fn is_inflated(&self, options: &FitOptions) -> bool {
-        self.inflation > options.inflation_limit
+    pub fn is_violated(&self, options: &FitOptions) -> bool {
+        self.violation > options.violation_limit
+    }
+
+    /// Factor on the standard deviations of the calibration: the two are of the same residuals, seen from two sides.
+    pub fn inflation(&self) -> f64 {
+        self.violation.max(self.correlation)
     }
 
     /// The same where all views fit worse than a stretch of them: their noise is taken to be that of the stretch.
@@ -51,7 +60,7 @@ impl Comparison {
         Self {
             ratio: self.ratio.max(ratio),
             is_significant: self.is_significant || ratio > self.ratio,
-            inflation: self.inflation.max(ratio),
+            violation: self.violation.max(ratio),
             ..self
         }
     }
@@ -65,7 +74,8 @@ impl Comparison {
             ratio: options.posterior_noise(best.fit.cost, best.fit.freedom) / fit.noise,
             noise: fit.noise,
             is_significant: fit.loss_deviations(best.fit.cost, best.fit.freedom) > options.misfit_deviations,
-            inflation: if projective.refutes(&metric, options) { root } else { 1.0 },
+            violation: if projective.refutes(&metric, options) { root } else { 1.0 },
+            correlation: 1.0,
         }
     }
 }

@@ -11,6 +11,7 @@ mod grading;
 mod misfit;
 mod models;
 mod options;
+mod profile;
 mod search;
 #[cfg(test)]
 mod tests;
@@ -277,10 +278,7 @@ pub fn from_metric(
     let choice = models::Choice { problem, scale_px, stop };
     let priors = choice.priors(fit.noise);
     let search = choice.search(&priors);
-    // Other focal lengths are tried only where a lens has them.
-    let is_of_lens = |factor: &f64| problem.options.lenses.is_plausible(factor * of_stretch.log_focal().exp());
-    let other_focals = problem.options.search.other_focals.into_iter().filter(is_of_lens);
-    let mut factors: Vec<f64> = std::iter::once(1.0).chain(other_focals).collect();
+    let mut factors: Vec<f64> = std::iter::once(1.0).chain(problem.options.search.other_focals).collect();
     if let Some(Stretch { problem, metric }) = &stretch {
         // Many views are adjusted from where few of them end, instead of from everywhere.
         let found = Search { problem, ..search }.minima_near(metric, &factors, heartbeat)?;

@@ -46,7 +46,7 @@ options! {
         /// The same ratio from which the metric reconstruction is not to be used at all.
         rms_ratio_refusal: f64 = 3.0,
         /// Factor on sigma by a misfit from which it is reported. More than half of the sigma comes of it.
-        inflation_limit: f64 = 2.0,
+        violation_limit: f64 = 2.0,
     }
 }
 
@@ -297,6 +297,8 @@ options! {
         /// Iterations there. Few-view scenes with hardly any turning and chains of 40 views converge within nine, to
         /// 1e-13 of the cost (a test).
         profile_iterations: usize = 15,
+        /// Standard deviations from which the squared influences of tracks are larger than chance has them.
+        correlation_deviations: f64 = GATE_QUANTILE,
     }
 }
 

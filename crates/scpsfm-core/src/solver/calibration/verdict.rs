@@ -55,11 +55,11 @@ impl<'a> Verdict<'a> {
             );
             self.cap(worst, WarningCode::ModelMismatch, detail);
             self.is_misfit = true;
-        } else if comparison.is_inflated(options) {
+        } else if comparison.is_violated(options) {
             let detail = format!(
                 "with {free} free the tracks violate the calibration {:.1} times as much as their noise explains; \
                  sigma is as much larger",
-                comparison.inflation
+                comparison.violation
             );
             self.warnings.push(Warning::new(WarningCode::ModelMismatch, detail));
         }

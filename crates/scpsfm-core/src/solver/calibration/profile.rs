@@ -1,0 +1,186 @@
+//! The profile of the cost along the focal length: how it rises, and how tracks pull on it.
+
+use nalgebra::Vector2;
+
+use super::models::{Candidate, Choice};
+use crate::geometry::bundle::Options;
+use crate::geometry::bundle::metric::{Intrinsics, IntrinsicsPrior, MetricReconstruction, Parameter};
+use crate::geometry::bundle::sequence;
+use crate::geometry::observation::Observation;
+
+/// Factors on the standard deviation of the log focal length that a linearisation gives for independent noise.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct Profile {
+    /// By how much the cost rises less than the linearisation has it; not below 1.
+    pub widening: f64,
+    /// Root of the squared influences of whole tracks over what they would be if the noise of the observations of a
+    /// track were independent; 1 where chance explains it.
+    pub correlation: f64,
+}
+
+impl Choice<'_> {
+    /// Holds the focal length, of several groups all in their ratios, three standard deviations away to either side,
+    /// while everything else adjusts.
+    ///
+    /// The chi-square should rise by nine. Near critical motions the linearisation is optimistic: it is taken where the
+    /// noise has moved the scene.
+    pub fn profile(&self, best: &Candidate) -> Profile {
+        let none = Profile { widening: 1.0, correlation: 1.0 };
+        let Some(sigma) = best.sigma_log_focal() else { return none };
+        let options = &self.problem.options.models;
+        let shift = (options.profile_deviations * sigma).min(options.profile_longest);
+        if shift <= 0.0 {
+            return none;
+        }
+        let (above, rise_above) = self.held(best, shift);
+        let (below, rise_below) = self.held(best, -shift);
+        let by_rise = shift / rise_above.min(rise_below).sqrt().max(f64::MIN_POSITIVE);
+        let along = |seen: &_| (above.residual(seen) - below.residual(seen)) / (2.0 * shift);
+        Profile { widening: (by_rise / sigma).max(1.0), correlation: self.correlation(best, along) }
+    }
+
+    /// The best reconstruction with its log focal length held at this distance, and the rise in chi-square.
+    fn held(&self, best: &Candidate, shift: f64) -> (MetricReconstruction, f64) {
+        let mut moved = best.minimum.reconstruction.clone();
+        moved.scale_focals(shift.exp());
+        let options = Options::squared(self.problem.options.models.profile_iterations);
+        let (observations, model) = (self.problem.observations, best.model.without_focal());
+        let report = sequence::adjust_all(&mut moved, observations, model, &best.priors, &options, self.stop);
+        let of_group = |(prior, intrinsics): (&IntrinsicsPrior, &Intrinsics)| {
+            let deviation = prior.deviation(Parameter::LogFocal, intrinsics);
+            prior.information[Parameter::LogFocal as usize] * deviation.powi(2)
+        };
+        let of_priors: f64 = best.priors.iter().zip(&moved.intrinsics).map(of_group).sum();
+        let rise = (report.cost + of_priors - best.minimum.cost).max(0.0) / best.fit.noise.powi(2);
+        (moved, rise)
+    }
+
+    /// As [`Profile::correlation`].
+    ///
+    /// The variance of an estimate from clusters whose noise is independent of each other (Liang & Zeger 1986): what
+    /// moves along a track, as an optical flow that drifts or a lens that no model here has, moves the focal length
+    /// with all its observations at once. Along the profile the points follow, so that their residuals are without
+    /// effect; what the cameras take up of the noise is counted.
+    ///
+    /// * `along`: derivative of an observation's residual by the log focal length, everything else following
+    fn correlation(&self, best: &Candidate, along: impl Fn(&Observation) -> Vector2<f64>) -> f64 {
+        let reconstruction = &best.minimum.reconstruction;
+        let mut of_track = vec![(0.0, 0.0); reconstruction.points.len()];
+        for seen in self.problem.observations {
+            let (along, (score, information)) = (along(seen), &mut of_track[seen.point]);
+            *score += seen.weight * along.dot(&reconstruction.residual(seen));
+            *information += seen.weight * along.norm_squared();
+        }
+        let (_, of_point) = MetricReconstruction::unknowns_each(reconstruction.has_common_centre);
+        let without_points = 2 * self.problem.observations.len() - of_point * self.problem.observed_points();
+        let unit = best.fit.noise.powi(2);
+        let sum = |of: &dyn Fn(&(f64, f64)) -> f64| of_track.iter().map(of).sum::<f64>();
+        let scores = sum(&|(score, _)| score.powi(2));
+        let expected = unit * sum(&|(_, information)| *information) * best.fit.freedom as f64 / without_points as f64;
+        let by_chance = unit * (2.0 * sum(&|(_, information)| information.powi(2))).sqrt();
+        match scores > expected + self.problem.options.models.correlation_deviations * by_chance {
+            true => (scores / expected).sqrt(),
+            false => 1.0,
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use nalgebra::Vector4;
+    use rand::SeedableRng;
+    use rand_chacha::ChaCha8Rng;
+
+    use super::*;
+    use crate::domain::StopToken;
+    use crate::geometry::bundle::metric::IntrinsicsModel;
+    use crate::geometry::bundle::testing::{self, TestScene, normal};
+    use crate::solver::calibration::options::CalibrationOptions;
+    use crate::solver::calibration::tests::of_one_lens;
+
+    const NOISE: f64 = 0.001;
+
+    /// A scene in which every track lives five views: what is far apart is held together by many weak links.
+    fn banded(seed: u64, views: usize) -> TestScene {
+        let mut scene = testing::scene(seed, views, 10 * views, NOISE);
+        let first = |point: usize| point % (views - 4);
+        scene.observations.retain(|seen| (first(seen.point)..first(seen.point) + 5).contains(&seen.view));
+        scene
+    }
+
+    /// The focal length held, everything else follows to the bottom of the valley, however long that takes.
+    #[test]
+    fn the_profile_is_taken_where_all_else_has_followed() {
+        let turning = [0.1, 0.02].into_iter().flat_map(|turning| {
+            (0..3).map(move |seed| {
+                (format!("turning {turning}, seed {seed}"), testing::scene_turning(seed, 40, NOISE, turning))
+            })
+        });
+        let banded = [10, 20, 40]
+            .into_iter()
+            .flat_map(|views| (0..3).map(move |seed| (format!("{views} views, seed {seed}"), banded(seed, views))));
+        let options = CalibrationOptions::DEFAULT.models;
+        let mut longest = 0;
+        for (case, scene) in turning.chain(banded) {
+            let points: Vec<Vector4<f64>> = scene.points.iter().map(|point| point.push(1.0)).collect();
+            let cameras = scene.cameras();
+            let problem = of_one_lens(&cameras, &points, &scene.observations, NOISE);
+            let (priors, stop) = (vec![problem.options.lenses.prior(NOISE, None, 1000.0)], StopToken::default());
+            let choice = Choice { problem: &problem, scale_px: 1000.0, stop: &stop };
+            let reconstruction = scene.reconstruction();
+            for model in [IntrinsicsModel::FOCAL, IntrinsicsModel::FULL] {
+                let minimum = choice.search(&priors).converged(reconstruction.clone(), model);
+                let best = Candidate::new(minimum, model, priors.clone(), &problem);
+                let sigma = best.sigma_log_focal().expect("observable");
+                let profiled = sigma * choice.profile(&best).widening;
+                let shift = (options.profile_deviations * sigma).min(options.profile_longest);
+                let mut rise = |shift: f64| {
+                    let mut moved = best.minimum.reconstruction.clone();
+                    moved.scale_focals(shift.exp());
+                    let options = Options { max_iterations: 5000, relative_tolerance: 1e-13, ..Options::default() };
+                    let model = model.without_focal();
+                    let report = sequence::adjust_all(&mut moved, &scene.observations, model, &priors, &options, &stop);
+                    longest = longest.max(report.iterations);
+                    (report.cost - best.minimum.cost) / best.fit.noise.powi(2)
+                };
+                let expected = sigma.max(shift / rise(shift).min(rise(-shift)).sqrt());
+                println!("{case}, {}: sigma {sigma:.5}, profiled {profiled:.5} for {expected:.5}", model.name());
+                assert!((profiled / expected - 1.0).abs() < 0.01, "{case}: {profiled} for {expected}");
+            }
+        }
+        println!("{longest} iterations at most");
+        assert!(longest < options.profile_iterations, "{longest} iterations");
+    }
+
+    /// Observations that drift along their tracks count as what they are; independent ones as before.
+    #[test]
+    fn what_moves_along_tracks_widens_sigma() {
+        let seeds = 60;
+        for (drift, least_raised, most_raised) in [(0.0, 0, 2), (2.0, 55, 60)] {
+            let (mut raised, mut before, mut after) = (0, 0.0, 0.0);
+            for seed in 0..seeds {
+                let mut scene = testing::scene(seed, 10, 60, NOISE);
+                let mut rng = ChaCha8Rng::seed_from_u64(seed);
+                let drifts: Vec<Vector2<f64>> =
+                    scene.points.iter().map(|_| Vector2::new(normal(&mut rng), normal(&mut rng))).collect();
+                let along = |view: usize| drift * NOISE * (view as f64 - 4.5) / 4.5;
+                scene.observations.iter_mut().for_each(|seen| seen.xy += along(seen.view) * drifts[seen.point]);
+                let points: Vec<Vector4<f64>> = scene.points.iter().map(|point| point.push(1.0)).collect();
+                let cameras = scene.cameras();
+                let problem = of_one_lens(&cameras, &points, &scene.observations, NOISE);
+                let (priors, stop) = (vec![problem.options.lenses.prior(NOISE, None, 1000.0)], StopToken::default());
+                let choice = Choice { problem: &problem, scale_px: 1000.0, stop: &stop };
+                let minimum = choice.search(&priors).converged(scene.reconstruction(), IntrinsicsModel::FOCAL);
+                let best = Candidate::new(minimum, IntrinsicsModel::FOCAL, priors.clone(), &problem);
+                let correlation = choice.profile(&best).correlation;
+                let error = best.minimum.log_focal() - scene.intrinsics.focal.ln();
+                let squared = (error / best.sigma_log_focal().expect("observable")).powi(2) / seeds as f64;
+                (before, after) = (before + squared, after + squared / correlation.powi(2));
+                raised += usize::from(correlation > 1.0);
+            }
+            println!("drift {drift}: raised in {raised}, mean squared deviation {before:.2}, then {after:.2}");
+            assert!((least_raised..=most_raised).contains(&raised), "drift {drift}: raised in {raised} of {seeds}");
+            assert!(after < 1.6 && (drift == 0.0 || before > 2.0), "drift {drift}: {before} before, {after} after");
+        }
+    }
+}
