@@ -126,10 +126,12 @@ pub struct Measured {
     pub failure: Option<String>,
     /// Largest Cramer-Rao bound of the log focal lengths, where it is known.
     pub bound: Option<f64>,
-    /// Observations that were kept, that shall be, and views that shall be registered.
+    /// Observations that were kept, that shall be, views that shall be registered, and how many of these right
+    /// observations connect.
     pub kept: usize,
     pub wanted: usize,
     pub due: usize,
+    pub connected: usize,
     /// Observations of the input.
     pub given: usize,
     /// Absolute trajectory error of the largest reconstruction over the length of the true path, where it is metric and
@@ -181,6 +183,7 @@ impl Measured {
             bound: sample.bounds.as_ref().and_then(|bounds| bounds.iter().copied().reduce(f64::max)),
             wanted: count(&sample.wanted),
             due: count(&sample.due),
+            connected: sample.connected,
             given: sample.right.len(),
             ..Self::default()
         }

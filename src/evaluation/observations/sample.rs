@@ -2,6 +2,7 @@
 
 use nalgebra::Vector3;
 use scpsfm_core::evaluation::bound;
+use scpsfm_core::evaluation::connection::connected_views;
 use serde::{Deserialize, Serialize};
 
 use crate::domain::error::InvalidInput;
@@ -60,11 +61,15 @@ impl Generator {
                 let mut of_view = vec![0; input.views.len()];
                 let views = input.view.iter().zip(&wanted).filter(|(_, wanted)| **wanted);
                 views.for_each(|(&view, _)| of_view[view as usize] += 1);
-                let due = of_view.into_iter().map(|count| count >= REGISTRABLE).collect();
+                let due: Vec<bool> = of_view.into_iter().map(|count| count >= REGISTRABLE).collect();
+                let places = input.view.iter().copied().zip(input.track.iter().copied()).zip(&wanted);
+                let seen: Vec<(u32, u32)> = places.filter(|(_, wanted)| **wanted).map(|(place, _)| place).collect();
+                let sets = connected_views(&seen, due.len()).into_iter();
+                let connected = sets.map(|set| set.iter().filter(|&&view| due[view]).count()).max().unwrap_or(0);
                 let centres = Some(truth.centres());
                 let right = truth.observation_right;
                 let sample = Sample::new(IMAGE_SIZE, input, truth.inlier, right, truth.focals_px);
-                Sample { bounds, wanted, due, centres, ..sample }
+                Sample { bounds, wanted, due, connected, centres, ..sample }
             }
         })
     }
@@ -84,6 +89,8 @@ pub struct Sample {
     pub wanted: Vec<bool>,
     /// Whether a view shall be registered.
     pub due: Vec<bool>,
+    /// How many of these views right observations connect, at most.
+    pub connected: usize,
     /// True focal length of each view.
     pub focals_px: Vec<f64>,
     /// Cramer-Rao bound of the standard deviation of each view's log focal length, where it is known.
@@ -97,7 +104,8 @@ impl Sample {
     fn new(size: ImageSize, input: RawInput, inlier: Vec<bool>, right: Vec<bool>, focals_px: Vec<f64>) -> Self {
         let wanted = right.iter().zip(&input.track).map(|(&right, &k)| right && inlier[k as usize]).collect();
         let due = vec![true; input.views.len()];
-        Self { size, due, input, inlier, right, wanted, focals_px, bounds: None, centres: None }
+        let connected = due.len();
+        Self { size, due, connected, input, inlier, right, wanted, focals_px, bounds: None, centres: None }
     }
 
     /// True focal length of each view and the bound of its estimate.

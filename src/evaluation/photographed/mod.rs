@@ -135,9 +135,11 @@ pub struct Row {
     pub weak_belied: Option<f64>,
     /// Mean over the answers that keep an observation.
     pub precision: Option<f64>,
-    /// Mean over the scenes that have verifiable observations, and views with enough of them.
+    /// Mean over the scenes that have verifiable observations, and views with enough of them; of the latter, what right
+    /// observations connect, too.
     pub recall: Option<f64>,
     pub views: Option<f64>,
+    pub connected: Option<f64>,
     /// Share of the answers that tell of a second structure; a peer tells none.
     pub second_structure: Option<f64>,
     pub seconds: f64,
@@ -168,6 +170,7 @@ impl Row {
             precision: mean(here.iter().filter(|measured| measured.kept > 0).map(|measured| measured.precision)),
             recall: mean(wanted().map(|measured| measured.recall)),
             views: mean(due().map(|measured| measured.views)),
+            connected: mean(due().map(|measured| measured.connected as f64 / measured.due as f64)),
             second_structure: mean(ours().map(|measured| f64::from(measured.second_structure))),
             seconds: mean(here.iter().map(|measured| measured.seconds)).unwrap_or(0.0),
             failures: here.iter().filter_map(|measured| measured.failure.clone()).collect(),

@@ -11,8 +11,9 @@ these. METR: METRIC answers; of these >3sg %: share beyond 3 sigma; off: number 
 1sg: share within 1 sigma (.68 where sigma is right). WEAK: WEAK answers and their share beyond 3 sigma. obs P:
 precision over the observations that were kept, of answers that keep any. obs R: recall over the verifiable
 observations, the right ones of tracks with at least three. views: registered share of those with 15 verifiable
-observations or more. 2nd %: share of the answers with SECOND_STRUCTURE. CPU s: mean; a peer's without what its start
-takes. A peer gets the scenes of one focal length.
+observations or more; conn.: share that right observations connect, by the solver's own numbers of tracks. 2nd %:
+share of the answers with SECOND_STRUCTURE. CPU s: mean; a peer's without what its start takes. A peer gets the scenes
+of one focal length.
 ";
 
 /// A line a row.
@@ -24,7 +25,7 @@ pub fn text(tables: &[Table]) -> String {
     for table in tables {
         let _ = writeln!(
             text,
-            "{:<width$} {:<6}{:>5}{:>8}{:>7}{:>6}{:>8}{:>5}{:>8}{:>6}{:>8}{:>8}{:>8}{:>8}{:>7}{:>9}",
+            "{:<width$} {:<6}{:>5}{:>8}{:>7}{:>6}{:>8}{:>5}{:>8}{:>6}{:>8}{:>8}{:>8}{:>8}{:>7}{:>7}{:>9}",
             table.by,
             "side",
             "n",
@@ -39,6 +40,7 @@ pub fn text(tables: &[Table]) -> String {
             "obs P",
             "obs R",
             "views",
+            "conn.",
             "2nd %",
             "CPU s"
         );
@@ -57,7 +59,7 @@ fn line(text: &mut String, width: usize, row: &Row) {
     let shown = |value: Option<f64>| value.map_or_else(|| "-".to_owned(), |value| format!("{value:.3}"));
     let _ = writeln!(
         text,
-        "{:<width$} {:<6}{:>5}{:>8.2}{:>7}{:>6}{:>8}{:>5}{:>8}{:>6}{:>8}{:>8}{:>8}{:>8}{:>7}{:>9.2}",
+        "{:<width$} {:<6}{:>5}{:>8.2}{:>7}{:>6}{:>8}{:>5}{:>8}{:>6}{:>8}{:>8}{:>8}{:>8}{:>7}{:>7}{:>9.2}",
         row.group,
         row.side.name(),
         row.scenes,
@@ -72,6 +74,7 @@ fn line(text: &mut String, width: usize, row: &Row) {
         shown(row.precision),
         shown(row.recall),
         shown(row.views),
+        shown(row.connected),
         percent(row.second_structure),
         row.seconds
     );

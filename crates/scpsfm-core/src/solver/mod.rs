@@ -42,7 +42,7 @@ mod recorder;
 mod scpsfm;
 pub(crate) mod search;
 mod second_structures;
-mod sequence;
+pub(crate) mod sequence;
 pub(crate) mod spread;
 mod static_tracks;
 #[cfg(test)]

@@ -31,6 +31,7 @@ mod windows;
 use std::ops::ControlFlow;
 
 pub use extended::Extended;
+pub use merging::MergingOptions;
 pub use options::{ExtensionOptions, GrowthOptions};
 pub use structure::widest_angle;
 
