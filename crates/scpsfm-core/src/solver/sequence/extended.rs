@@ -99,12 +99,6 @@ impl Extended {
         (self.is_calibrated(problem), self.model.registered().len())
     }
 
-    /// What decides between reconstructions that were found in different ways: a calibration that fits as well as
-    /// projective cameras before others, then how well the observations fit.
-    pub fn rank(&self, problem: &Problem) -> (bool, f64) {
-        (self.is_calibrated(problem) && self.fits(), self.evidence(problem))
-    }
-
     /// As [`evidence`].
     pub fn evidence(&self, problem: &Problem) -> f64 {
         let model = &self.model;
@@ -116,7 +110,7 @@ impl Extended {
     }
 
     /// Whether nothing says that projective cameras would fit better.
-    fn fits(&self) -> bool {
+    pub fn fits(&self) -> bool {
         let mut warnings = self.calibrations.iter().flat_map(|outcome| &outcome.warnings);
         warnings.all(|warning| warning.code != WarningCode::ModelMismatch)
     }

@@ -156,13 +156,15 @@ impl QuickPass {
             };
             best = by_projective_extension(problem, None, starts(first, false, rest), recorder)?;
         }
-        let best = best.filter(|best| metric.is_none() || best.is_trusted());
+        let metric = metric.map(Ended::Extended);
+        let may_replace = |best: &Attempt, metric: &Ended| {
+            best.is_trusted() || worth(best.evidence(problem), false) > metric.worth(problem)
+        };
+        let best = best.filter(|best| metric.as_ref().is_none_or(|metric| may_replace(best, metric)));
         Ok(match (best.map(|best| metric_of(problem, best, recorder)).transpose()?, metric) {
-            (Some(Ended::Extended(found)), Some(metric)) if found.rank(problem) > metric.rank(problem) => {
-                Ended::Extended(found)
-            }
-            (_, Some(metric)) => Ended::Extended(metric),
-            (found, None) => found.unwrap_or(Ended::Block(None)),
+            (Some(found), Some(metric)) if found.worth(problem) <= metric.worth(problem) => metric,
+            (None, Some(metric)) => metric,
+            (found, _) => found.unwrap_or(Ended::Block(None)),
         })
     }
 }
@@ -251,6 +253,13 @@ impl Ended {
             Ended::Extended(extended) => extended.evidence(problem),
             Ended::Block(attempt) => attempt.as_ref().map_or(0.0, |attempt| attempt.evidence(problem)),
         }
+    }
+
+    /// What decides between reconstructions that were found in different ways, see [`worth`]: of a calibration, whether
+    /// it fits as well as projective cameras.
+    fn worth(&self, problem: &Problem) -> f64 {
+        let fits = self.calibrated_extension(problem).is_some_and(Extended::fits);
+        worth(self.evidence(problem), fits)
     }
 
     /// What it began from.
@@ -430,8 +439,8 @@ fn by_projective_extension(
             continue;
         }
         attempt::calibrate(problem, &mut attempt, &[], recorder)?;
-        let rank = |attempt: &Attempt| (attempt.is_calibrated(), attempt.evidence(problem));
-        if best.as_ref().is_none_or(|best| outweighs(&attempt, best) || rank(&attempt) > rank(best)) {
+        let worth = |attempt: &Attempt| worth(attempt.evidence(problem), attempt.is_calibrated());
+        if best.as_ref().is_none_or(|best| outweighs(&attempt, best) || worth(&attempt) > worth(best)) {
             best = Some(attempt);
         }
         if best.as_ref().is_some_and(Attempt::is_good) {
@@ -439,6 +448,12 @@ fn by_projective_extension(
         }
     }
     Ok(best.or(unsolved))
+}
+
+/// What a reconstruction is worth: its evidence, and with a calibration [`ExtensionOptions::worth_of_calibration`] times
+/// that.
+fn worth(evidence: f64, is_calibrated: bool) -> f64 {
+    if is_calibrated { ExtensionOptions::DEFAULT.worth_of_calibration * evidence } else { evidence }
 }
 
 /// Whether an attempt is verified by depths, and worth more than another that is not, see [`Attempt::outweighs`].

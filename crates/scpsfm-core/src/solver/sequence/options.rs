@@ -119,6 +119,9 @@ options! {
         /// calibrated too. One that holds the same tracks differs by a few observations; a fiftieth more are others.
         /// Calibrating each took 140 s instead of 26 where it took longest, for the same grade.
         least_evidence_growth: f64 = 1.02,
+        /// Evidence of projective cameras, in that of a calibrated reconstruction, from which they stand before it: a
+        /// calibration of most views, or nearly, is worth more than poses of none, one of a few is not.
+        worth_of_calibration: f64 = 2.0,
     }
 }
 
