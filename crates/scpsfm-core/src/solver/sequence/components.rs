@@ -113,7 +113,7 @@ fn add(
     Ok(stands)
 }
 
-/// Joins the views that are left by fewer points, see [`GrowthOptions::LAST`], and merges what these connect.
+/// Joins the views that are left by fewer points, see [`GrowthOptions::LAST`], and merges components that share enough.
 ///
 /// # Errors
 /// [`Error::Stopped`].
@@ -124,21 +124,12 @@ pub fn join_rest(
     recorder: &mut Recorder,
 ) -> Result<(), Error> {
     let rest: Vec<usize> = (0..problem.views()).filter(|&view| model.poses[view].is_none()).collect();
-    if rest.is_empty() {
-        return Ok(());
-    }
     for component in model.components() {
-        let views = model.of_component(component).len();
-        // One that was merged into another meanwhile.
-        if views == 0 {
-            continue;
-        }
-        register::join_again(problem, model, component, &GrowthOptions::LAST, &rest, trials, recorder)?;
-        let has_grown = model.of_component(component).len() > views;
-        let mut merged = has_grown.then(|| merging::merge(problem, model, component, recorder)).flatten();
-        while let Some(into) = merged {
-            register::join_again(problem, model, into, &GrowthOptions::LAST, &rest, trials, recorder)?;
-            merged = merging::merge(problem, model, into, recorder);
+        // Some were merged into others meanwhile.
+        let mut grown = Some(component).filter(|component| !model.of_component(*component).is_empty());
+        while let Some(component) = grown {
+            register::join_again(problem, model, component, &GrowthOptions::LAST, &rest, trials, recorder)?;
+            grown = merging::merge(problem, model, component, recorder);
         }
     }
     Ok(())
@@ -192,21 +183,15 @@ fn priors(problem: &Problem, seed: &Attempt, model: &Model) -> Vec<Option<FocalP
 }
 
 /// Takes back the views of a component that see too few of its points to be held by them, and the whole component if
-/// too few are left. Returns the views taken back.
+/// too few are left.
 pub fn drop_unsupported(
     problem: &Problem,
     model: &mut Model,
     component: u32,
     options: &GrowthOptions,
     recorder: &mut Recorder,
-) -> Vec<usize> {
-    let unsupported = |&view: &usize| {
-        let kept = problem.of_view[view].iter().filter(|&&k| {
-            let k = k as usize;
-            model.kept[k] && model.landmarks[problem.track_of(k)].is_some_and(|landmark| landmark.is_verified())
-        });
-        kept.count() < options.least_agreeing
-    };
+) {
+    let unsupported = |&view: &usize| model.held_by(problem, view) < options.least_agreeing;
     let views = model.of_component(component);
     let mut dropped: Vec<usize> = views.iter().copied().filter(unsupported).collect();
     if views.len() - dropped.len() < consensus::LEAST_VIEWS {
@@ -215,7 +200,6 @@ pub fn drop_unsupported(
     model.unregister(problem, &dropped);
     structure::triangulate_seen(problem, model, &dropped, recorder);
     recorder.registered(model.registered().len());
-    dropped
 }
 
 /// Numbers the components anew, the one with most views first; of equals the one found first.

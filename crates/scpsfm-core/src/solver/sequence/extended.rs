@@ -46,12 +46,12 @@ pub fn extend(problem: &Problem, seed: Attempt, recorder: &mut Recorder) -> Resu
         recorder.step(Task::Adjust, round + 1, rounds, within);
         adjust::all(problem, &mut model, recorder);
         structure::triangulate(problem, &mut model, recorder);
-        for component in 0..=model.component_of.iter().copied().max().unwrap_or(FIRST) {
-            let dropped = components::drop_unsupported(problem, &mut model, component, &options, recorder);
-            // After the last round nothing would check the views that join.
-            if !dropped.is_empty() && round + 1 < rounds {
-                register::join_again(problem, &mut model, component, &options, &dropped, &mut trials, recorder)?;
-            }
+        for component in model.components() {
+            components::drop_unsupported(problem, &mut model, component, &options, recorder);
+        }
+        // After the last round nothing would check the views that join.
+        if round + 1 < rounds {
+            components::join_rest(problem, &mut model, &mut trials, recorder)?;
         }
         recorder.report(within);
     }

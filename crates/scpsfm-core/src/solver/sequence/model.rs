@@ -242,6 +242,15 @@ impl Model {
             .collect()
     }
 
+    /// Observations of a view that verified landmarks explain: what holds it in its component.
+    pub fn held_by(&self, problem: &Problem, view: usize) -> usize {
+        let holds = |&&k: &&u32| {
+            let k = k as usize;
+            self.kept[k] && self.landmarks[problem.track_of(k)].is_some_and(|landmark| landmark.is_verified())
+        };
+        problem.of_view[view].iter().filter(holds).count()
+    }
+
     pub fn intrinsics_of(&self, problem: &Problem, view: usize) -> Intrinsics {
         let shared = self.lenses[problem.camera_of[view]].intrinsics;
         match self.own_focals.get(view) {

@@ -11,6 +11,7 @@ use super::structure;
 use crate::domain::LeftOut;
 use crate::geometry::bundle::metric::{Intrinsics, Pose};
 use crate::geometry::pose::{self, Correspondences};
+use crate::solver::consensus::LEAST_VIEWS;
 use crate::solver::error::Error;
 use crate::solver::problem::Problem;
 use crate::solver::recorder::Recorder;
@@ -86,8 +87,12 @@ impl Growth for Component<'_> {
         self.model.of_component(self.component).len()
     }
 
+    /// Views of other components are open, too, that may be held by more points of this one: a component that began
+    /// with a wrong block would keep them from the right one.
     fn is_open(&self, view: usize) -> bool {
-        self.model.poses[view].is_none()
+        let Self { problem, model, component, .. } = self;
+        let is_other = || model.component_of[view] != *component;
+        model.poses[view].is_none() || is_other() && model.held_by(problem, view) < model.supported[view]
     }
 
     fn support(&self, view: usize) -> usize {
@@ -112,12 +117,20 @@ impl Growth for Component<'_> {
             .rev()
             .max_by_key(|(_, (_, agreeing))| *agreeing);
         let Some((intrinsics, (pose, agreeing))) = found else { return 0 };
-        if agreeing < options.least_agreeing || (agreeing as f64) < options.least_share * seen.len() as f64 {
+        let is_enough =
+            agreeing >= options.least_agreeing && agreeing as f64 >= options.least_share * seen.len() as f64;
+        if !is_enough || model.poses[view].is_some() && agreeing <= model.held_by(problem, view) {
             return agreeing;
         }
         model.set_intrinsics(problem, view, intrinsics);
+        let left = model.poses[view].map(|_| model.component_of[view]);
         model.register(problem, view, *component, pose);
-        structure::triangulate_seen(problem, model, &[view], recorder);
+        let mut changed = vec![view];
+        if let Some(rest) = left.map(|left| model.of_component(left)).filter(|rest| rest.len() < LEAST_VIEWS) {
+            model.unregister(problem, &rest);
+            changed.extend(rest);
+        }
+        structure::triangulate_seen(problem, model, &changed, recorder);
         adjust::around(problem, model, view, is_new_lens, recorder);
         structure::triangulate_seen(problem, model, &[view], recorder);
         let registered = model.registered();
@@ -187,4 +200,52 @@ fn robust_pose(
     let robust = if model.has_common_centre { pose::robust_rotation } else { pose::robust };
     let found = robust(&Correspondences { points: &points, seen: &rays, weights: &weights }, gate, rng, problem.stop)?;
     Some((found.model, found.inlier_count()))
+}
+
+#[cfg(test)]
+mod tests {
+    use nalgebra::{Matrix3, Rotation3, Vector3};
+
+    use super::*;
+    use crate::domain::{Input, Limits, Silent, SolveSettings, StopToken};
+    use crate::parallel::Threads;
+    use crate::solver::sequence::model::FIRST;
+    use crate::synthetic::{Sequence, SequenceOptions};
+
+    /// Views that a wrong component holds by a few points go to the one that most of their points are of; views of a
+    /// component that is right stay.
+    #[test]
+    fn views_go_to_the_component_that_more_of_their_points_hold_them_in() {
+        for seed in 0..5 {
+            let options = SequenceOptions { views: 14, tracks: 600, seed, ..SequenceOptions::default() };
+            let Sequence { input, truth, .. } = Sequence::generate(&options).expect("valid options");
+            let input = Input::new(input, &Limits::default(), "sequence").expect("a valid sequence");
+            let (settings, stop) = (SolveSettings::default(), StopToken::default());
+            let problem = Problem::new(&input, &settings, Threads::ONE, &stop);
+            let intrinsics = Intrinsics::from_focal(truth.focal_px / problem.scale_px);
+            let pose = |view: usize, turn: f64| {
+                let rotation = Matrix3::from_fn(|row, column| truth.rotations[view][row][column]);
+                let turn = Rotation3::from_scaled_axis(Vector3::new(0.0, turn, 0.5 * turn)).into_inner();
+                Pose { rotation: turn * rotation, translation: turn * Vector3::from(truth.translations[view]) }
+            };
+            let mut silent = Silent;
+            let mut recorder = Recorder::new(&mut silent, options.views);
+            // Those of the wrong component are turned about in turns, so that they contradict each other.
+            let mut components_after = |is_wrong: &dyn Fn(usize) -> bool, is_other: &dyn Fn(usize) -> bool| {
+                let mut model = Model::new(&problem, intrinsics, options.noise);
+                for view in 0..options.views {
+                    let turn = if is_wrong(view) { 0.01 * [1.0, -1.0][view % 2] } else { 0.0 };
+                    model.register(&problem, view, FIRST + u32::from(is_other(view)), pose(view, turn));
+                }
+                structure::triangulate(&problem, &mut model, &mut recorder);
+                let mut trials = vec![Trial::default(); options.views];
+                join(&problem, &mut model, FIRST, &mut trials, &mut recorder).expect("not stopped");
+                [FIRST, FIRST + 1].map(|component| model.of_component(component).len())
+            };
+            let is_late = |view: usize| view >= 10;
+            assert_eq!(components_after(&is_late, &is_late), [14, 0], "seed {seed}: the other one is wrong");
+            let is_early = |view: usize| view < 4;
+            assert_eq!(components_after(&is_early, &|view| view >= 4), [4, 10], "seed {seed}: it is wrong itself");
+        }
+    }
 }
