@@ -72,6 +72,8 @@ pub struct Row {
     pub seconds: Option<f64>,
     /// Why there is no focal length.
     pub reason: Option<String>,
+    /// Codes of the warnings of its solve.
+    pub warnings: Vec<&'static str>,
 }
 
 impl Row {
@@ -94,6 +96,7 @@ impl Row {
             reprojection_rms_px: None,
             seconds: None,
             reason: Some(reason),
+            warnings: Vec::new(),
         }
     }
 
@@ -102,6 +105,13 @@ impl Row {
         let calibration = solution.calibrations.first();
         let why = warnings::reason(solution);
         let why = why.map_or_else(String::new, |warning| format!("{}: {}", warning.code.name(), warning.detail));
+        // Several cameras may have the same warning.
+        let mut codes = Vec::new();
+        for code in solution.warnings.iter().map(|warning| warning.code.name()) {
+            if !codes.contains(&code) {
+                codes.push(code);
+            }
+        }
         Self {
             registered_views: solution.registered_views().len(),
             inlier_tracks: solution.inlier_track_count(),
@@ -116,6 +126,7 @@ impl Row {
             reprojection_rms_px: solution.reprojection_rms_px,
             seconds: Some(solution.seconds),
             reason: calibration.is_none().then_some(why),
+            warnings: codes,
             ..Self::unsolved(index, input, String::new())
         }
     }
@@ -181,13 +192,13 @@ impl Table {
     pub fn csv(&self) -> String {
         let mut text = String::from(
             "window,first_view,last_view,registered_views,tracks,inlier_tracks,observations,inlier_observations,focal_px,\
-             sigma_log_focal,grade,reprojection_mean_px,reprojection_rms_px,seconds,reason\n",
+             sigma_log_focal,grade,reprojection_mean_px,reprojection_rms_px,seconds,reason,warnings\n",
         );
         let number = |value: Option<f64>| value.map_or_else(String::new, |value| value.to_string());
         for row in &self.windows {
             let reason = row.reason.clone().map_or_else(String::new, |reason| Label::Name(reason.into()).csv());
             text.push_str(&format!(
-                "{},{},{},{},{},{},{},{},{},{},{},{},{},{},{reason}\n",
+                "{},{},{},{},{},{},{},{},{},{},{},{},{},{},{reason},{}\n",
                 row.window,
                 row.first_view.csv(),
                 row.last_view.csv(),
@@ -202,6 +213,7 @@ impl Table {
                 number(row.reprojection_mean_px),
                 number(row.reprojection_rms_px),
                 number(row.seconds),
+                row.warnings.join(" "),
             ));
         }
         text
@@ -230,7 +242,13 @@ impl Table {
                 shown(row.reprojection_mean_px, 1.0, 3),
                 shown(row.seconds, 1.0, 2)
             ));
-            text.push_str(&row.reason.as_ref().map_or_else(String::new, |reason| format!("  {reason}")));
+            // The reason begins with the code of its warning.
+            let reason = row.reason.as_deref().unwrap_or_default();
+            let codes = row.warnings.iter().copied().filter(|code| !reason.starts_with(code));
+            let notes: Vec<&str> = codes.chain(Some(reason).filter(|reason| !reason.is_empty())).collect();
+            if !notes.is_empty() {
+                text.push_str(&format!("  {}", notes.join(", ")));
+            }
             text.push('\n');
         }
         let average = |name: &str, pick: fn(&Average) -> f64| {
@@ -317,9 +335,13 @@ mod tests {
         let csv = table.csv();
         let lines: Vec<&str> = csv.lines().collect();
         assert_eq!(lines.len(), 4);
-        assert!(lines[1].starts_with("1,3,43,5,40,20,200,100,"), "{csv}");
-        assert!(lines[2].ends_with(",,,NO_RECONSTRUCTION,,,,\"nothing, \"\"at all\"\"\""), "{csv}");
-        assert!(lines[3].ends_with("UNOBSERVABLE_FOCAL: the camera only moved sideways"), "{csv}");
-        assert!(table.text().contains("2 of 3 windows solved"), "{}", table.text());
+        assert!(lines[1].starts_with("1,3,43,5,40,20,200,100,") && lines[1].ends_with(",,FEW_INLIERS"), "{csv}");
+        assert!(lines[2].ends_with(",,,NO_RECONSTRUCTION,,,,\"nothing, \"\"at all\"\"\","), "{csv}");
+        let turned = "UNOBSERVABLE_FOCAL: the camera only moved sideways";
+        assert!(lines[3].ends_with(&format!("{turned},UNOBSERVABLE_FOCAL")), "{csv}");
+        let text = table.text();
+        let rows: Vec<&str> = text.lines().collect();
+        assert!(rows[1].ends_with("  FEW_INLIERS") && rows[3].ends_with(&format!("  {turned}")), "{text}");
+        assert!(text.contains("2 of 3 windows solved"), "{text}");
     }
 }

@@ -138,7 +138,9 @@ fn windows_are_solved_alone_and_alike_on_any_number_of_threads() {
     let views: Vec<_> = rows.iter().map(|row| (row["first_view"].as_u64(), row["last_view"].as_u64())).collect();
     assert_eq!(views, [(Some(0), Some(4)), (Some(2), Some(6))]);
     assert_eq!((&of_one["views_left"], of_one["solved"].as_u64()), (&1.into(), Some(2)), "{of_one}");
+    assert!(csv.lines().next().is_some_and(|header| header.ends_with(",reason,warnings")), "{csv}");
     for row in rows {
+        assert!(row["warnings"].is_array(), "{row}");
         assert!(row["reprojection_mean_px"].as_f64().is_some_and(|px| (0.1..1.0).contains(&px)), "{row}");
         assert!(
             row["inlier_tracks"].as_u64() > Some(50) && row["tracks"].as_u64() > row["inlier_tracks"].as_u64(),
