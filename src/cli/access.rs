@@ -128,10 +128,10 @@ pub struct TenantArg {
 }
 
 impl TenantArg {
-    const ID: &str = "tenant";
+    pub const ID: &str = "tenant";
 
     /// What the flag says.
-    fn flag(&self) -> Option<&str> {
+    pub fn flag(&self) -> Option<&str> {
         self.id.as_deref().filter(|_| self.is_flag)
     }
 

@@ -3,6 +3,7 @@
 use clap::Subcommand;
 use serde_json::{Value, json};
 
+use super::access::TenantArg;
 use super::args::ServerArgs;
 use super::exit::{Exit, Failure};
 use super::print;
@@ -41,8 +42,9 @@ pub enum Action {
     Drain(ActionArgs),
 }
 
-/// What each of them takes.
+/// What each of them takes: no tenant, since the queue and its servers are those of all.
 #[derive(Debug, clap::Args)]
+#[command(mut_arg(TenantArg::ID, |tenant| tenant.hide(true)))]
 pub struct ActionArgs {
     #[command(flatten)]
     pub server: ServerArgs,
@@ -55,6 +57,11 @@ pub struct ActionArgs {
 /// Runs the command.
 pub async fn run(args: Args) -> Result<Exit, Failure> {
     let (Action::Queue(given) | Action::Pause(given) | Action::Resume(given) | Action::Drain(given)) = &args.action;
+    if let Some(tenant) = given.server.access.tenant.flag() {
+        return Err(Failure::usage(format_args!(
+            "--tenant {tenant}: the queue and its servers are those of all tenants; leave it out"
+        )));
+    }
     let mut client = given.server.connect().await?;
     let queue = match args.action {
         Action::Queue(_) => client.queue().await?,
