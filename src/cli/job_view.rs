@@ -73,6 +73,11 @@ pub fn job_line(job: &Job) -> String {
     if job.cancel_requested && !job.state.is_terminal() {
         line.push_str("  cancel requested");
     }
+    // That of new jobs is 0.
+    if job.priority != 0 {
+        line.push_str(&format!("  priority {}", job.priority));
+    }
+    job.labels.iter().for_each(|(key, value)| line.push_str(&format!("  {key}={value}")));
     line
 }
 

@@ -11,7 +11,7 @@ use crate::domain::job::JobState;
 const EXAMPLES: &str = "\
 Examples:
   scpsfm list
-  scpsfm list --state queued --state running
+  scpsfm list --state queued,running
   scpsfm list --filter 'state = QUEUED OR state = RUNNING AND labels.site = \"north\"'
   scpsfm list --all --filter 'labels.site = \"north\"' --json | jq -r .name";
 
@@ -24,8 +24,8 @@ pub struct Args {
     #[command(flatten)]
     pub server: ServerArgs,
 
-    /// Only jobs in this state; may be given more than once
-    #[arg(long = "state", value_enum, ignore_case = true)]
+    /// Only jobs in one of these states, in lower or upper case
+    #[arg(long = "state", value_enum, ignore_case = true, value_delimiter = ',')]
     pub states: Vec<JobState>,
 
     /// Only jobs that match, such as 'labels.site = "north"' or 'state = FAILED OR state = CANCELLED': terms joined by
@@ -47,14 +47,15 @@ impl ValueEnum for JobState {
     }
 
     fn to_possible_value(&self) -> Option<PossibleValue> {
-        Some(PossibleValue::new(match self {
-            Self::DeadlineExceeded => "deadline-exceeded",
-            Self::Queued => "queued",
-            Self::Running => "running",
-            Self::Succeeded => "succeeded",
-            Self::Failed => "failed",
-            Self::Cancelled => "cancelled",
-        }))
+        Some(match self {
+            // With an underscore as it is printed.
+            Self::DeadlineExceeded => PossibleValue::new("deadline-exceeded").alias("deadline_exceeded"),
+            Self::Queued => PossibleValue::new("queued"),
+            Self::Running => PossibleValue::new("running"),
+            Self::Succeeded => PossibleValue::new("succeeded"),
+            Self::Failed => PossibleValue::new("failed"),
+            Self::Cancelled => PossibleValue::new("cancelled"),
+        })
     }
 }
 

@@ -11,6 +11,17 @@ use crate::support::program::{Run, Serving, run};
 use crate::support::scrape::Page;
 use crate::support::server::soon;
 
+#[test]
+fn commands_on_the_whole_server_take_no_tenant() {
+    for action in ["queue", "pause", "resume", "drain"] {
+        let refused = run(["admin", action, "--tenant", "north", "--server", "http://127.0.0.1:1"]);
+        assert_eq!(refused.code, Some(2), "{refused:?}");
+        assert!(refused.stderr.contains("--tenant north: ") && refused.stderr.contains("all tenants"), "{refused:?}");
+        let help = run(["admin", action, "--help"]).stdout;
+        assert!(help.contains("--api-key-file") && !help.contains("--tenant"), "{help}");
+    }
+}
+
 fn admin(server: &Serving, action: &str) -> Run {
     let done = run(["admin", action, "--json", "--server", &server.grpc]);
     assert_eq!(done.code, Some(0), "{done:?}");
@@ -97,7 +108,16 @@ async fn commands_retry_jobs_and_change_their_order() {
     let changed = command(&["priority", &name, "-5", "--json"]);
     assert_eq!(changed.code, Some(0), "{changed:?}");
     assert_eq!(serde_json::from_str::<Value>(&changed.stdout).expect("JSON")["priority"], -5);
+    for told in [command(&["priority", &name, "7"]), command(&["get", &name]), command(&["list"])] {
+        assert!(told.stdout.trim_end().ends_with("  priority 7"), "{told:?}");
+    }
     assert_eq!(command(&["priority", &name, "1001"]).code, Some(2));
+    for states in [&["--state", "RUNNING,queued"][..], &["--state", "DEADLINE_EXCEEDED", "--state", "queued"]] {
+        let listed = command(&[&["list"], states].concat());
+        assert!(listed.stdout.contains(&name), "{states:?}: {listed:?}");
+    }
+    let others = command(&["list", "--state", "running,deadline-exceeded"]);
+    assert_eq!((others.code, others.stdout.as_str()), (Some(0), ""));
     assert_eq!(command(&["cancel", &name]).code, Some(0));
     let refused = command(&["priority", &name, "1"]);
     assert_eq!(refused.code, Some(65), "{refused:?}");
