@@ -1,5 +1,6 @@
 //! Arguments that several commands share.
 
+use std::ops::RangeInclusive;
 use std::str::FromStr;
 
 use clap::Args;
@@ -50,6 +51,17 @@ pub fn parse_whole<T: FromStr>(text: &str) -> Result<T, String> {
         let digits = !text.is_empty() && text.bytes().all(|byte| byte.is_ascii_digit());
         if digits { "is too large a number".into() } else { "is not a whole number >= 0".into() }
     })
+}
+
+/// The same within a range.
+///
+/// # Errors
+/// For anything else.
+pub fn parse_within(range: RangeInclusive<u64>) -> impl Fn(&str) -> Result<u64, String> + Clone {
+    move |text| match parse_whole(text)? {
+        number if range.contains(&number) => Ok(number),
+        _ => Err(format!("is not in {range:?}")),
+    }
 }
 
 /// Which page of a list.

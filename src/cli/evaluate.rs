@@ -6,7 +6,7 @@ use std::path::{Path, PathBuf};
 use clap::ValueEnum;
 use serde_json::{Value, json};
 
-use super::args::cores;
+use super::args::{cores, parse_within};
 use super::evaluate_choices::{ContestantArg, DepthsArg, SweepArg};
 use super::evaluate_long::{self, LongArgs};
 use super::evaluate_observations::{self, ObservationArgs};
@@ -73,7 +73,7 @@ pub struct Args {
     pub out: PathBuf,
 
     /// Scenes a cell [default: 20, with --quick 4, with --photographed 300 in all, with --long 1]
-    #[arg(long, value_name = "N", value_parser = clap::value_parser!(u64).range(1..=MOST_SEEDS))]
+    #[arg(long, value_name = "N", value_parser = parse_within(1..=MOST_SEEDS))]
     pub seeds: Option<u64>,
 
     /// A first impression: 4 seeds, and of the sweeps only cells that take less than a few seconds

@@ -4,6 +4,7 @@ use std::ops::Range;
 
 use serde_json::json;
 
+use super::args::parse_within;
 use super::evaluate_suite::{MOST_SEEDS, SuiteRunner, chosen};
 use super::exit::{Exit, Failure};
 use crate::evaluation::observations;
@@ -28,7 +29,7 @@ pub struct PhotographedArgs {
     pub photographed: bool,
     /// First of the --seeds seeds. Use another one to check a result on scenes that the program was not tuned on
     #[arg(long, value_name = "SEED", default_value_t = photographed::FIRST_SEED, requires = "photographed",
-        value_parser = clap::value_parser!(u64).range(..=u64::MAX - MOST_SEEDS))]
+        value_parser = parse_within(0..=u64::MAX - MOST_SEEDS))]
     pub first_seed: u64,
 }
 

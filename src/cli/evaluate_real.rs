@@ -5,6 +5,7 @@ use std::time::Duration;
 
 use serde_json::json;
 
+use super::args::parse_within;
 use super::evaluate_suite::{RunCounts, with_note};
 use super::exit::{Exit, Failure};
 use super::interrupt::Interrupt;
@@ -45,7 +46,7 @@ pub struct RealArgs {
 
     /// Seconds after which the peer is ended on a sequence
     #[arg(long, value_name = "SECONDS", requires = "peer", default_value_t = 600,
-        value_parser = clap::value_parser!(u64).range(1..=1_000_000))]
+        value_parser = parse_within(1..=1_000_000))]
     pub peer_timeout: u64,
 }
 

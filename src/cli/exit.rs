@@ -3,7 +3,7 @@
 use std::fmt;
 use std::process::ExitCode;
 
-use crate::domain::{InvalidInput, Solution, Status};
+use crate::domain::{InvalidInput, Solution, Status, Violation};
 use crate::formats;
 
 /// The codes, as `scpsfm --help` shows them, and every command that solves or talks to a server.
@@ -76,6 +76,15 @@ impl Failure {
 
     pub fn usage(message: impl fmt::Display) -> Self {
         Self::new(Exit::Usage, message)
+    }
+
+    /// Options out of range, by the flags that have their names: `--noise-px: ...`.
+    pub fn of_flags(invalid: &InvalidInput) -> Self {
+        let of_flag = |violation: &Violation| {
+            let option = violation.field.rsplit('.').next().unwrap_or_default();
+            format!("--{}: {}", option.replace('_', "-"), violation.description)
+        };
+        Self::usage(invalid.violations().iter().map(of_flag).collect::<Vec<_>>().join("; "))
     }
 
     pub fn bad_config(message: impl fmt::Display) -> Self {

@@ -19,11 +19,11 @@ pub struct InputArgs {
     /// The kind is told from the name and the first bytes; --format overrides. `-` is a table on standard input.
     ///
     /// In the CSV, a line is an observation, in pixels; the centre of the top-left pixel is (0, 0); sigma is one
-    /// standard deviation of a coordinate. Ids are whole numbers from 0, other columns are ignored. OpenSfM's
-    /// coordinates are relative to the image size, which is read from exif/IMAGE.exif beside the file; --width and
-    /// --height give that of images without one. Of a database, matches are joined into tracks; a match that would put
-    /// two keypoints of one image into one track is cut. A model gives its tracks; its poses, points and calibration
-    /// are not used.
+    /// standard deviation of a coordinate, of which only the ratios between observations count. Ids are whole numbers
+    /// from 0; other columns are not read, which a note says. OpenSfM's coordinates are relative to the image size,
+    /// which is read from exif/IMAGE.exif beside the file; --width and --height give that of images without one. Of a
+    /// database, matches are joined into tracks; a match that would put two keypoints of one image into one track is
+    /// cut. A model gives its tracks; its poses, points and calibration are not used.
     #[arg(value_name = "INPUT")]
     pub input: PathBuf,
 
@@ -45,6 +45,7 @@ impl InputArgs {
 fn parse_side(text: &str) -> Result<u32, String> {
     match parse_whole(text)? {
         0 => Err("an image has at least one pixel".into()),
+        side if side > ImageSize::MAX_SIDE_PX => Err(format!("no image has more than {} px", ImageSize::MAX_SIDE_PX)),
         side => Ok(side),
     }
 }

@@ -13,11 +13,11 @@ use crate::synthetic::{Motion, NoiseKind, OutlierKind, Scene, SceneOptions, Shap
 #[command(next_help_heading = "The scene")]
 pub struct SceneArgs {
     /// Views (images)
-    #[arg(long, default_value_t = 10)]
+    #[arg(long, default_value_t = 10, value_parser = parse_whole::<usize>)]
     pub views: usize,
 
     /// Tracks; each is seen in every view
-    #[arg(long, default_value_t = 200)]
+    #[arg(long, default_value_t = 200, value_parser = parse_whole::<usize>)]
     pub tracks: usize,
 
     /// Standard deviation of the noise as a share of the image width
@@ -57,7 +57,7 @@ impl SceneArgs {
     /// # Errors
     /// A measure out of range, as wrong usage.
     pub fn generate(&self, with_depths: bool) -> Result<Scene, Failure> {
-        Scene::generate(&self.options(with_depths)).map_err(Failure::usage)
+        Scene::generate(&self.options(with_depths)).map_err(|invalid| Failure::of_flags(&invalid))
     }
 }
 
@@ -94,19 +94,19 @@ pub struct OutlierArgs {
     pub outlier_kind: OutlierKindArg,
 
     /// Views in which an outlier is wrong, random ones for each track; 0: all that can be, or half if repeated
-    #[arg(long, value_name = "N", default_value_t = 0)]
+    #[arg(long, value_name = "N", default_value_t = 0, value_parser = parse_whole::<usize>)]
     pub wrong_views: usize,
 
     /// Views that observe a track, neighbours of each other; 0: all
-    #[arg(long, value_name = "N", default_value_t = 0)]
+    #[arg(long, value_name = "N", default_value_t = 0, value_parser = parse_whole::<usize>)]
     pub seen_views: usize,
 
     /// Observations of every right track that are anywhere in the image instead, in random views for each track
-    #[arg(long, value_name = "N", default_value_t = 0)]
+    #[arg(long, value_name = "N", default_value_t = 0, value_parser = parse_whole::<usize>)]
     pub wrong_observations: usize,
 
     /// Observations of every track that are left out, random ones for each track
-    #[arg(long, value_name = "N", default_value_t = 0)]
+    #[arg(long, value_name = "N", default_value_t = 0, value_parser = parse_whole::<usize>)]
     pub deleted_observations: usize,
 
     /// Share of all tracks that belong to a second moving body; they count among the outliers

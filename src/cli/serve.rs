@@ -5,6 +5,7 @@ use std::path::PathBuf;
 use clap::ValueEnum;
 use tokio_util::sync::CancellationToken;
 
+use super::args::parse_whole;
 use super::exit::{Exit, Failure};
 use super::interrupt::Signals;
 use super::service::Service;
@@ -70,16 +71,16 @@ pub struct Args {
     pub store: Option<GivenUrl>,
 
     /// Worker threads, one job each; 0: one a core [default: 0]
-    #[arg(long, value_name = "N")]
+    #[arg(long, value_name = "N", value_parser = parse_whole::<usize>)]
     pub workers: Option<usize>,
 
     /// Threads that one job may keep busy, its worker's among them; 0: one a core. The result is the same. Worth more
     /// than one where fewer long sequences wait than there are cores [default: 1]
-    #[arg(long, value_name = "N")]
+    #[arg(long, value_name = "N", value_parser = parse_whole::<usize>)]
     pub threads: Option<usize>,
 
     /// Waiting jobs at which new ones are refused [default: 256]
-    #[arg(long, value_name = "N")]
+    #[arg(long, value_name = "N", value_parser = parse_whole::<usize>)]
     pub queue: Option<usize>,
 
     /// Tensor backend of jobs that ask for none [default: flex]

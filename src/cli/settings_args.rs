@@ -19,10 +19,10 @@ pub struct SettingsArgs {
     pub seed: u64,
 
     #[arg(long, value_name = "N", help = format!("Iterations of each optimisation of the network, 1 to {}; `scpsfm` \
-        does up to 16 of them, `paper` one, `auto` usually none", SolveSettings::MAX_ITERATIONS),
-        default_value_t = SolveSettings::DEFAULT_ITERATIONS,
+        does up to 16 of them, `paper` one, `auto` usually none [default: {}]",
+        SolveSettings::MAX_ITERATIONS, SolveSettings::DEFAULT_ITERATIONS),
         value_parser = clap::value_parser!(u32).range(1..=i64::from(SolveSettings::MAX_ITERATIONS)))]
-    pub iterations: u32,
+    pub iterations: Option<u32>,
 
     /// Leave the DAQ residual (self-calibration) out of the losses and scores
     #[arg(long)]
@@ -38,8 +38,8 @@ pub struct SettingsArgs {
     pub noise_px: Option<f64>,
 
     /// A focal length a view (a zoom) instead of one for all: the grade is WEAK at best then, all views share one lens,
-    /// and camera groups and priors are not looked at
-    #[arg(long)]
+    /// and camera groups and focal lengths known beforehand are not looked at
+    #[arg(long, conflicts_with = "focal_px")]
     pub focal_per_view: bool,
 
     /// Tensor backend of the network [default: flex, or what the server is configured with]
@@ -51,57 +51,82 @@ pub struct SettingsArgs {
         SolveSettings::DEFAULT_ALPHA, SolveSettings::PAPER_ALPHA))]
     pub alpha: Option<f64>,
 
-    /// Weight of the loss L_DAQ
-    #[arg(long, hide_short_help = true, default_value_t = SolveSettings::DEFAULT_BETA)]
-    pub beta: f64,
+    #[arg(long, hide_short_help = true, help = format!("Weight of the loss L_DAQ [default: {}]",
+        SolveSettings::DEFAULT_BETA))]
+    pub beta: Option<f64>,
 
-    /// Least number of inliers that the loss L_num asks for (the paper's t) at the first iteration; with `paper`, at
-    /// every iteration
-    #[arg(long, hide_short_help = true, value_name = "T", default_value_t = SolveSettings::DEFAULT_MIN_INLIERS)]
-    pub min_inliers: f64,
+    #[arg(long, hide_short_help = true, value_name = "T", help = format!("Least number of inliers that the loss L_num \
+        asks for (the paper's t) at the first iteration; with `paper`, at every iteration [default: {}]",
+        SolveSettings::DEFAULT_MIN_INLIERS))]
+    pub min_inliers: Option<f64>,
 
-    /// Slope of the sigmoid in L_num, with `paper` only; 1 is as printed and may let all weights collapse to 0
-    #[arg(long, hide_short_help = true, default_value_t = SolveSettings::DEFAULT_KAPPA)]
-    pub kappa: f64,
+    #[arg(long, hide_short_help = true, help = format!("Slope of the sigmoid in L_num, with `paper` only; 1 is as \
+        printed and may let all weights collapse to 0 [default: {}]", SolveSettings::DEFAULT_KAPPA))]
+    pub kappa: Option<f64>,
 
-    /// Learning rate of Adam
-    #[arg(long, hide_short_help = true, value_name = "RATE", default_value_t = SolveSettings::DEFAULT_LEARNING_RATE)]
-    pub learning_rate: f64,
+    #[arg(long, hide_short_help = true, value_name = "RATE", help = format!("Learning rate of Adam [default: {}]",
+        SolveSettings::DEFAULT_LEARNING_RATE))]
+    pub learning_rate: Option<f64>,
 
-    /// Width of the network as a share of the original PointNet
-    #[arg(long, hide_short_help = true, value_name = "SHARE", default_value_t = SolveSettings::DEFAULT_NETWORK_WIDTH)]
-    pub network_width: f64,
+    #[arg(long, hide_short_help = true, value_name = "SHARE", help = format!("Width of the network as a share of the \
+        original PointNet [default: {}]", SolveSettings::DEFAULT_NETWORK_WIDTH))]
+    pub network_width: Option<f64>,
 }
+
+/// Methods that optimise the network on the input.
+const OF_NETWORK: &[MethodArg] = &[MethodArg::Auto, MethodArg::Paper, MethodArg::Scpsfm];
 
 impl SettingsArgs {
     /// The settings, checked.
     ///
     /// # Errors
-    /// A value out of range, as wrong usage.
+    /// A value out of range, and a flag that changes nothing with the method, as wrong usage.
     pub fn settings(&self) -> Result<SolveSettings, Failure> {
         let method = self.method.into();
+        let defaults = SolveSettings::of_method(method);
         let settings = SolveSettings {
             method,
             use_daq: !self.no_daq,
-            alpha: self.alpha.unwrap_or(SolveSettings::default_alpha(method)),
-            beta: self.beta,
-            min_inliers: self.min_inliers,
-            kappa: self.kappa,
-            learning_rate: self.learning_rate,
-            iterations: self.iterations,
-            network_width: self.network_width,
+            alpha: self.alpha.unwrap_or(defaults.alpha),
+            beta: self.beta.unwrap_or(defaults.beta),
+            min_inliers: self.min_inliers.unwrap_or(defaults.min_inliers),
+            kappa: self.kappa.unwrap_or(defaults.kappa),
+            learning_rate: self.learning_rate.unwrap_or(defaults.learning_rate),
+            iterations: self.iterations.unwrap_or(defaults.iterations),
+            network_width: self.network_width.unwrap_or(defaults.network_width),
             epipolar_depths: self.epipolar_depths,
             seed: self.seed,
             noise_px: self.noise_px,
             focal_per_view: self.focal_per_view,
             backend: self.backend.map(Backend::from),
-            ..SolveSettings::default()
+            ..defaults
         };
-        settings.validate().map_err(Failure::usage)?;
-        if self.epipolar_depths && !matches!(self.method, MethodArg::Paper | MethodArg::Scpsfm | MethodArg::Psfm) {
-            return Err(Failure::usage("--epipolar-depths is of use with --method paper, scpsfm and psfm only"));
-        }
+        settings.validate().map_err(|invalid| Failure::of_flags(&invalid))?;
+        self.check_use()?;
         Ok(settings)
+    }
+
+    /// Refuses flags that change nothing with the method.
+    fn check_use(&self) -> Result<(), Failure> {
+        use MethodArg::{Auto, Geometry, Paper, Psfm, Scpsfm};
+        let flags: [(&str, bool, &[MethodArg]); 9] = [
+            ("--epipolar-depths", self.epipolar_depths, &[Paper, Scpsfm, Psfm]),
+            ("--no-daq", self.no_daq, &[Auto, Paper, Scpsfm, Geometry]),
+            ("--kappa", self.kappa.is_some(), &[Paper]),
+            ("--alpha", self.alpha.is_some(), OF_NETWORK),
+            ("--beta", self.beta.is_some(), OF_NETWORK),
+            ("--min-inliers", self.min_inliers.is_some(), OF_NETWORK),
+            ("--learning-rate", self.learning_rate.is_some(), OF_NETWORK),
+            ("--network-width", self.network_width.is_some(), OF_NETWORK),
+            ("--iterations", self.iterations.is_some(), OF_NETWORK),
+        ];
+        match flags.into_iter().find(|(_, is_given, methods)| *is_given && !methods.contains(&self.method)) {
+            Some((flag, _, methods)) => {
+                let names: Vec<String> = methods.iter().map(|&of| Method::from(of).name().to_lowercase()).collect();
+                Err(Failure::usage(format_args!("{flag} is of use with --method {} only", names.join(", "))))
+            }
+            None => Ok(()),
+        }
     }
 }
 

@@ -2,6 +2,7 @@
 
 use std::path::{Path, PathBuf};
 
+use super::args::parse_whole;
 use super::exit::{Exit, Failure};
 pub use super::scene_args::SceneArgs;
 use super::scene_args::{CameraArgs, GeometryArgs, OutlierArgs};
@@ -98,11 +99,12 @@ pub struct SequenceArgs {
     pub joined: f64,
 
     /// The focal length grows steadily over its range, f (1 +- SHARE of --zoom), instead of at random
-    #[arg(long, requires = "sequence")]
+    #[arg(long, requires_all = ["sequence", "zoom"])]
     pub ramp: bool,
 
     /// Views, the first ones, in which the camera does not turn; where it never turns, nothing can be calibrated
-    #[arg(long, value_name = "VIEWS", default_value_t = 0, requires = "sequence")]
+    #[arg(long, value_name = "VIEWS", default_value_t = 0, requires = "sequence",
+        value_parser = parse_whole::<usize>)]
     pub straight: usize,
 }
 
@@ -116,7 +118,7 @@ fn lifetime(text: &str) -> Result<(usize, usize), String> {
 impl Args {
     fn generate(&self) -> Result<Scene, Failure> {
         let options = self.geometry.apply(self.scene.options(self.depths));
-        Scene::generate(&self.camera.apply(self.outliers.apply(options))).map_err(Failure::usage)
+        Scene::generate(&self.camera.apply(self.outliers.apply(options))).map_err(|invalid| Failure::of_flags(&invalid))
     }
 
     fn generate_sequence(&self) -> Result<Sequence, Failure> {
@@ -135,7 +137,7 @@ impl Args {
             straight: self.sequence.straight,
             seed: self.scene.seed,
         };
-        Sequence::generate(&options).map_err(Failure::usage)
+        Sequence::generate(&options).map_err(|invalid| Failure::of_flags(&invalid))
     }
 }
 

@@ -7,7 +7,7 @@ use std::time::Instant;
 
 use indicatif::{ProgressBar, ProgressStyle};
 
-use super::args::parse_whole;
+use super::args::{parse_whole, parse_within};
 use super::exit::{Exit, Failure};
 use super::interrupt::Interrupt;
 use crate::domain::counted;
@@ -49,7 +49,7 @@ pub struct Args {
     pub seed: u64,
 
     /// Steps, each on two batches of 2 to 24 scenes; the learning rate falls with the share that is done
-    #[arg(long, value_name = "N", default_value_t = STEPS, value_parser = clap::value_parser!(u64).range(1..=10_000_000))]
+    #[arg(long, value_name = "N", default_value_t = STEPS, value_parser = parse_within(1..=10_000_000))]
     pub steps: u64,
 
     /// Learn from the paper's losses L_num and L_proj instead of labels, for comparison: such a network ranks tracks

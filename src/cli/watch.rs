@@ -1,6 +1,6 @@
 //! `scpsfm watch`: follows a job.
 
-use super::args::ServerArgs;
+use super::args::{ServerArgs, parse_whole};
 use super::exit::{Exit, Failure};
 use super::job_view::{self, GivenName};
 
@@ -25,7 +25,7 @@ pub struct Args {
     pub server: ServerArgs,
 
     /// Begin after the event of this sequence number
-    #[arg(long, value_name = "N", default_value_t = 0)]
+    #[arg(long, value_name = "N", default_value_t = 0, value_parser = parse_whole::<u64>)]
     pub after: u64,
 
     /// One event a line on stdout, as JSON, instead of progress

@@ -214,8 +214,13 @@ const FOCAL_LIMITS_PX: (f64, f64) = (100.0, 100_000.0);
 pub(in crate::synthetic) fn check_focal_range((least, most): (f64, f64), found: &mut Violations) {
     let (shortest, longest) = FOCAL_LIMITS_PX;
     if !(least >= shortest && least <= most && most <= longest) {
-        let reason = format!("{least:e} to {most:e} px is not a range within {shortest}..={longest} px");
-        found.push(Violation::of("focal_range_px", reason));
+        found.push(match least == most {
+            true => Violation::of("focal_px", format!("{least:?} px is not within {shortest}..={longest} px")),
+            false => Violation::of(
+                "focal_range_px",
+                format!("{least:?} to {most:?} px is not a range within {shortest}..={longest} px"),
+            ),
+        });
     }
 }
 
@@ -258,8 +263,8 @@ mod tests {
             ("radial_k1", SceneOptions { radial_k1: f64::INFINITY, ..default() }),
             ("zoom", SceneOptions { zoom: 1.0, ..default() }),
             ("focal_range_px", SceneOptions { focal_range_px: (500.0, 400.0), ..default() }),
-            ("focal_range_px", SceneOptions { focal_range_px: (0.0, 0.0), ..default() }),
-            ("focal_range_px", SceneOptions { focal_range_px: (1e308, 1e308), ..default() }),
+            ("focal_px", SceneOptions { focal_range_px: (0.0, 0.0), ..default() }),
+            ("focal_px", SceneOptions { focal_range_px: (1e308, 1e308), ..default() }),
             ("focal_range_px", SceneOptions { focal_range_px: (f64::NAN, 900.0), ..default() }),
         ];
         for (name, options) in cases {
