@@ -9,6 +9,7 @@ pub mod cameras_json;
 pub mod colmap;
 pub mod error;
 pub mod export;
+mod focal_priors;
 pub mod input;
 pub mod intrinsics_json;
 pub mod json;

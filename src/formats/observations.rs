@@ -9,12 +9,16 @@ use super::input::{LabelledInput, display_path};
 use super::label::{Label, dense};
 use super::source::{OPENSFM_TRACKS, SQLITE_MAGIC};
 use super::text::{self, Lines, number, quote, whole};
-use crate::domain::{ImageSize, Limits, RawInput, View};
+use crate::domain::{ImageSize, Limits, RawInput, View, counted};
 
 /// Columns that must be there, in the order in which they are looked for.
 const REQUIRED: [&str; 4] = ["view", "track", "x", "y"];
 const DEPTH: &str = "depth";
 const SIGMA: &str = "sigma";
+/// A column of the tables that a solve writes, and of no input.
+const OF_ANSWERS: &str = "inlier";
+/// Unknown columns that a note names.
+const MOST_NAMED: usize = 5;
 
 /// Reads the observations of a file and checks what only the file can tell: syntax, ids, duplicates.
 ///
@@ -103,7 +107,8 @@ fn parse(reader: impl BufRead, path: &Path, limits: &Limits, size: Option<ImageS
     if table.lines.is_empty() {
         return Err(Error::whole(&file, "has a header but no observations"));
     }
-    let labelled = table.into_labelled(path, size);
+    let mut labelled = table.into_labelled(path, size);
+    labelled.notes.extend(columns.and_then(|columns| columns.unread()));
     labelled.refuse_duplicates()?;
     Ok(labelled)
 }
@@ -140,7 +145,9 @@ fn header(text: &str) -> Result<Columns, String> {
     for (place, wanted) in required.iter_mut().zip(REQUIRED) {
         *place = find(wanted)?.ok_or_else(|| {
             let quoted = quote(text);
-            if names.iter().all(|name| name.parse::<f64>().is_ok()) {
+            if names.iter().any(|name| name == OF_ANSWERS) {
+                "this is a table that a solve wrote, an answer and no input: give the file that was solved".into()
+            } else if names.iter().all(|name| name.parse::<f64>().is_ok()) {
                 format!("no header; the first line must be `view,track,x,y[,depth][,sigma]`, not {quoted}")
             } else {
                 format!("the header {quoted} has no column `{wanted}`; `view,track,x,y[,depth][,sigma]` is needed")
@@ -151,6 +158,18 @@ fn header(text: &str) -> Result<Columns, String> {
 }
 
 impl Columns {
+    /// Says which columns are not read; one of them may be misspelt.
+    fn unread(&self) -> Option<String> {
+        let known = REQUIRED.into_iter().chain([DEPTH, SIGMA]).collect::<Vec<_>>();
+        let unread: Vec<String> =
+            self.names.iter().filter(|name| !known.contains(&name.as_str())).map(|name| quote(name)).collect();
+        let more = if unread.len() > MOST_NAMED { ", ..." } else { "" };
+        let named = unread[..unread.len().min(MOST_NAMED)].join(", ");
+        (!unread.is_empty()).then(|| {
+            format!("{} not read: {named}{more}; those that are: {}", counted(unread.len(), "column"), known.join(", "))
+        })
+    }
+
     /// Parses one line; an error names the column and says what is wrong.
     fn row(&self, text: &str) -> Result<Row, (&'static str, String)> {
         let fields: Vec<&str> = text.split(',').map(unquote).collect();
@@ -172,8 +191,18 @@ impl Columns {
             x: number(x).map_err(|what| ("x", what))?,
             y: number(y).map_err(|what| ("y", what))?,
             depth: self.depth.map(|place| number(fields[place])).transpose().map_err(|what| (DEPTH, what))?,
-            sigma: self.sigma.map(|place| number(fields[place])).transpose().map_err(|what| (SIGMA, what))?,
+            sigma: self.sigma.map(|place| sigma(fields[place])).transpose().map_err(|what| (SIGMA, what))?,
         })
+    }
+}
+
+/// The observation is there, whatever is known of its noise.
+fn sigma(field: &str) -> Result<f64, String> {
+    match field {
+        "" => Err("is empty; give every observation one, where it is not known that of most others, or leave out the \
+                   column"
+            .into()),
+        _ => number(field),
     }
 }
 

@@ -71,10 +71,21 @@ fn reads_and_writes_what_is_known_of_the_noise() {
     assert_eq!(csv(&good(text).raw), text);
     let alone = "view,track,x,y,sigma\n0,0,1,2,0.5\n1,0,1,2,2\n";
     assert_eq!(csv(&good(alone).raw), alone);
+    let empty = bad(alone.replace("0.5", ""));
+    assert!(empty[0].contains("line 2: sigma: is empty; give every observation one"), "{empty:?}");
     for wrong in ["0", "-1", "inf", "1e9"] {
         let problems = bad(alone.replace("0.5", wrong));
         assert!(problems[0].contains("line 2: sigma: "), "{wrong}: {problems:?}");
     }
+}
+
+#[test]
+fn columns_that_are_not_read_are_told() {
+    assert!(good(GOOD).notes.is_empty());
+    let notes = good("view,track,x,y,depht,Name\n0,0,1,2,3.5,a\n1,0,1,2,-4,b\n").notes;
+    assert_eq!(notes, ["2 columns not read: `depht`, `name`; those that are: view, track, x, y, depth, sigma"]);
+    let many = good("a,b,c,view,track,x,y,d,e,f\n1,1,1,0,0,1,2,3,3,3\n1,1,1,1,0,1,2,3,3,3\n").notes;
+    assert!(many[0].starts_with("6 columns not read: `a`, `b`, `c`, `d`, `e`, ...; "), "{many:?}");
 }
 
 #[test]
@@ -151,6 +162,7 @@ fn files_that_are_no_table_are_called_what_they_are() {
     starts(b"view;track;x;y\n", ", line 1: columns are separated by semicolons");
     starts(b"0,0,1.5,2\n", ", line 1: no header");
     starts(b"view,track,u,v\n0,0,1,2\n", ", line 1: the header `view,track,u,v` has no column `x`");
+    starts(b"view,track,x_px,y_px,inlier\n0,0,1,2,1\n", ", line 1: this is a table that a solve wrote");
     starts(b"view,track,x,y,x\n", ", line 1: the header names the column `x` twice");
     starts(b"view,track,x,y\n", ": has a header but no observations");
     starts(&[b'7'; text::MAX_TABLE_LINE_BYTES + 1], ", line 1: longer than");
@@ -161,7 +173,7 @@ fn files_that_are_no_table_are_called_what_they_are() {
 fn one_view_or_no_overlap_is_said_of_the_file() {
     assert_eq!(
         bad("view,track,x,y\n4,0,1,2\n4,1,1,2\n"),
-        ["dir/observations.csv: 1 view given, at least 2 are needed"]
+        ["dir/observations.csv: 1 view given; a reconstruction needs at least 3"]
     );
 }
 

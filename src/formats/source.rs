@@ -6,7 +6,7 @@ use std::path::{Path, PathBuf};
 
 use super::error::Error;
 use super::input::{LabelledInput, display_path};
-use super::{colmap, observations, opensfm, text, view_table};
+use super::{colmap, focal_priors, observations, opensfm, result_files, text, view_table};
 use crate::domain::{FocalPrior, ImageSize, Limits};
 
 /// The path that stands for standard input, as with most programs.
@@ -99,6 +99,7 @@ pub fn read(path: &Path, limits: &Limits, reading: &Reading) -> Result<LabelledI
     if is_colmap && stream.is_some() {
         return Err(whole("is a stream; COLMAP's files are read by their paths".into()));
     }
+    refuse_other(format, path).map_err(whole)?;
     if is_colmap && reading.size.is_some() {
         return Err(whole("carries the sizes of its images; leave out --width and --height".into()));
     }
@@ -134,6 +135,7 @@ pub fn read(path: &Path, limits: &Limits, reading: &Reading) -> Result<LabelledI
         }
         view_table::apply(table, limits, &mut labelled)?;
     }
+    labelled.notes.extend(focal_priors::doubts(&labelled.raw));
     Ok(labelled)
 }
 
@@ -171,8 +173,28 @@ fn told_from(beginning: &[u8]) -> Format {
     }
 }
 
+/// Says so where `--format` or a name calls something one of COLMAP's files that is none, before any flag is found not
+/// to fit.
+fn refuse_other(format: Format, path: &Path) -> Result<(), String> {
+    match format {
+        Format::ColmapDatabase => {
+            let mut beginning = Vec::new();
+            let magic = SQLITE_MAGIC.len() as u64;
+            File::open(path).and_then(|file| file.take(magic).read_to_end(&mut beginning)).map_err(cannot_read)?;
+            // An empty file is a database without tables.
+            let is_database = beginning.is_empty() || beginning == SQLITE_MAGIC;
+            if is_database { Ok(()) } else { Err("is no COLMAP database".into()) }
+        }
+        Format::ColmapModel if !path.is_dir() => Err("is no COLMAP model, which is a directory".into()),
+        Format::ColmapModel | Format::Observations | Format::OpenSfm => Ok(()),
+    }
+}
+
 /// What to give instead of this directory.
 fn what_a_directory_lacks(path: &Path) -> String {
+    if path.join(result_files::RESULT).exists() {
+        return "is the directory of an answer; give the file that was solved".into();
+    }
     let below = ["database.db", "tracks.csv", "observations.csv", "sparse/0", "sparse"];
     match below.into_iter().find(|name| path.join(name).exists()) {
         Some(name) => format!("is a directory without a COLMAP model; give its {name}"),
@@ -211,6 +233,9 @@ mod tests {
         let directory = tempfile::tempdir().expect("a temporary directory");
         let refused = || detect(directory.path()).expect_err("no model");
         assert!(refused().contains("without a COLMAP model (cameras"), "{}", refused());
+        fs::write(directory.path().join("result.json"), "").expect("written");
+        assert!(refused().contains("is the directory of an answer"), "{}", refused());
+        fs::remove_file(directory.path().join("result.json")).expect("removed");
         fs::write(directory.path().join("database.db"), "").expect("written");
         assert!(refused().ends_with("give its database.db"), "{}", refused());
         for name in ["cameras.txt", "images.txt"] {
@@ -249,11 +274,14 @@ mod tests {
         assert!(refused(Reading { matches, ..Reading::default() }).contains("leave out --matches"));
         let size = Some(ImageSize { width_px: 4, height_px: 3 });
         let database = Reading { size, format: Some(Format::ColmapDatabase), ..Reading::default() };
-        assert!(refused(database).contains("leave out --width and --height"));
-        let view_table = Some("views.csv".into());
-        let cameras = Reading { view_table, format: Some(Format::ColmapDatabase), ..Reading::default() };
-        assert!(refused(cameras).contains("leave out --view-table"));
+        assert!(refused(database.clone()).ends_with("is no COLMAP database"));
+        let model = Reading { format: Some(Format::ColmapModel), ..database.clone() };
+        assert!(refused(model).contains("is no COLMAP model"));
         let table = Reading { format: Some(Format::Observations), ..Reading::default() };
         assert!(refused(table).contains("is an OpenSfM tracks.csv"));
+        fs::write(&path, SQLITE_MAGIC).expect("written");
+        assert!(refused(database.clone()).contains("leave out --width and --height"));
+        let cameras = Reading { size: None, view_table: Some("views.csv".into()), ..database };
+        assert!(refused(cameras).contains("leave out --view-table"));
     }
 }

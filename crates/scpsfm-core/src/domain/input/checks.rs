@@ -5,6 +5,7 @@ use std::collections::HashMap;
 use super::{FocalPrior, ImageSize, Input, RawInput, View};
 use crate::domain::error::{Violation, Violations, quoted};
 use crate::domain::limits::Limits;
+use crate::domain::result::VERIFIED;
 use crate::domain::words::counted;
 
 pub(super) fn check_counts(raw: &RawInput, limits: &Limits, field: &impl Fn(&str) -> String, found: &mut Violations) {
@@ -52,10 +53,10 @@ pub(super) fn check_counts(raw: &RawInput, limits: &Limits, field: &impl Fn(&str
     }
 }
 
-/// What is wrong with fewer than two views.
+/// What is wrong with fewer than two views. Of two a solve says the same: only with the network do they have weights.
 pub fn too_few_views(count: usize) -> String {
     let given = if count == 1 { "1 view" } else { "no views" };
-    format!("{given} given, at least 2 are needed")
+    format!("{given} given; a reconstruction needs at least {VERIFIED}")
 }
 
 pub(super) fn check_views(views: &[View], field: &impl Fn(&str) -> String, found: &mut Violations) {
@@ -177,7 +178,10 @@ pub(super) fn check_views_with_observations(raw: &RawInput, field: &impl Fn(&str
     }
     let count = seen.iter().filter(|&&seen| seen).count();
     if count < 2 {
-        found.push(Violation::of(field("view_indices"), "all observations lie in one view, at least 2 are needed"));
+        found.push(Violation::of(
+            field("view_indices"),
+            format!("all observations lie in one view; a reconstruction needs at least {VERIFIED}"),
+        ));
     }
 }
 
