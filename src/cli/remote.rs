@@ -43,7 +43,7 @@ impl From<Error> for Failure {
             None => error.message,
         };
         if (error.kind, error.setting) == (ErrorKind::Unavailable, Some(Setting::Server)) {
-            message.push_str("; start one with `scpsfm serve`, or say --server");
+            message.push_str("; `scpsfm serve` starts one, --server or SCPSFM_SERVER names another");
         }
         if error.may_be_stored {
             message.push_str(
@@ -135,7 +135,7 @@ mod tests {
         let away = Error { setting: Some(Setting::Server), ..error(ErrorKind::Unavailable, "no server answers") };
         let failure = Failure::from(away);
         assert_eq!(failure.exit, Exit::Unavailable);
-        assert!(failure.message.starts_with("no server answers; start one with `scpsfm serve`"), "{failure}");
+        assert!(failure.message.starts_with("no server answers; `scpsfm serve` starts one"), "{failure}");
         let lost = Error { may_be_stored: true, ..error(ErrorKind::Unavailable, "it may have been stored") };
         assert!(Failure::from(lost).message.starts_with("it may have been stored: look with `scpsfm list`"));
     }

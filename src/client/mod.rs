@@ -126,6 +126,11 @@ impl Client {
             let words = format!("{server:?} is not a URL of the form http://HOST:PORT or https://HOST:PORT");
             ErrorKind::Usage.error(words).about(Setting::Server)
         };
+        if !server.contains("://") {
+            let words =
+                format!("`server` {server:?} has no scheme: put http:// in front, or https:// for a server with TLS");
+            return Err(ErrorKind::Usage.error(words).about(Setting::Server));
+        }
         if !server.starts_with("http://") && !server.starts_with("https://") {
             return Err(no_url());
         }

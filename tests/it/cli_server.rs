@@ -136,14 +136,15 @@ fn flags_that_only_a_server_can_refuse_are_wrong_usage() {
     let input = text(&input);
     let serving = Serving::start(&directory.path().join("data"));
     let long_key = format!("{}=x", "k".repeat(64));
-    let cases: [(&[&str], &str); 7] = [
+    let cases: [(&[&str], &str); 8] = [
         (&["submit", input, "--label", &long_key], "job.labels"),
         (&["submit", input, "--job-id", "A"], "job_id"),
         (&["submit", input, "--request-id", "a b"], "request_id"),
         (&["submit", input, "--time-limit", "1e15"], "job.time_limit"),
         (&["list", "--filter", "colour = red"], "filter"),
         (&["list", "--page-token", "made-up"], "page_token"),
-        (&["list", "--server", "localhost:1"], "http://HOST:PORT"),
+        (&["list", "--server", "localhost:1"], "--server \"localhost:1\" has no scheme: put http:// in front"),
+        (&["list", "--server", "ftp://localhost:1"], "http://HOST:PORT"),
     ];
     for (arguments, names) in cases {
         // A later --server is none: clap takes one.
