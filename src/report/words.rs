@@ -39,7 +39,7 @@ pub fn warning(code: WarningCode) -> &'static str {
             "No image size was given, so the extent of the points stood in; the principal point may be off."
         }
         WarningCode::PointsOutsideImage => {
-            "Points lie outside the image size that was given; with a wrong size the calibration is wrong."
+            "The points do not lie as pixels of images of the given size do; with a wrong size the calibration is wrong."
         }
         WarningCode::CameraGroupsMerged => "Views of different cameras or sizes were treated as one camera.",
         WarningCode::UnverifiedRanking => {

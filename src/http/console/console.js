@@ -52,7 +52,7 @@ const WARNINGS = {
   PURE_TRANSLATION: "The camera moved without turning",
   PRINCIPAL_POINT_UNOBSERVABLE: "The data do not determine the principal point",
   SECOND_STRUCTURE: "Rejected tracks agree on another rigid motion",
-  POINTS_OUTSIDE_IMAGE: "Points lie outside the image size that was given",
+  POINTS_OUTSIDE_IMAGE: "Points do not fit the image size that was given",
   UNVERIFIED_RANKING: "Nothing was verified; weights are a network's ranking",
   DUPLICATE_TRACKS: "Tracks have the same observations",
   STATIC_TRACKS: "Tracks stay in place in the image",

@@ -6,6 +6,7 @@
 pub mod digest;
 pub mod duplicates;
 pub mod error;
+pub mod image_fit;
 pub mod input;
 mod input_digest;
 pub mod joined_tracks;

@@ -1,10 +1,10 @@
-//! The transform from pixels that a whole solve uses, and whether the image sizes that it rests on hold the points.
+//! The transform from pixels that a whole solve uses.
 
 use nalgebra::Vector2;
 
+use crate::domain::image_fit::{self, ImageFitOptions};
 use crate::domain::{ImageSize, Input, Warning, WarningCode};
 use crate::geometry::measurement::Normalization;
-use crate::geometry::statistics::median;
 
 /// The transform from pixels of a solve: principal points assumed in the image centres, lengths in units of the largest
 /// image side.
@@ -33,65 +33,10 @@ pub fn normalization(input: &Input) -> (Normalization, Vec<Warning>) {
             ),
         ));
     }
-    warnings.extend(outside(input));
+    warnings.extend(image_fit::suspicion(input, &ImageFitOptions::DEFAULT));
     // All points in one place: any scale will do.
     let scale_px = if scale_px > 0.0 { scale_px } else { 1.0 };
     (Normalization { centres_px, scale_px }, warnings)
-}
-
-/// Distance from the middle of the image within which half of the points must lie, in the longer image side: within an
-/// image it is half a side at most, the paper's scenes, whose cameras see beyond their image, have .8 of it, and a size
-/// that is three times too small shows.
-const MEDIAN_WITHIN: f64 = 1.0;
-
-/// Share of the points beyond the right or lower edge of their image, and none beyond the others, from which its size
-/// is suspect: that of a reduced copy leaves half of the points out, exchanged sides a fiftieth and more. Points of
-/// scenes that were made up lie beyond all edges.
-const BEYOND_TWO_EDGES: f64 = 0.01;
-/// How far beyond an edge a point may lie, in pixels: there are conventions that differ by half of one.
-const EDGE_PX: f64 = 1.0;
-
-/// Says so where the points do not lie in images of the size that was given: the calibration rests on its middle.
-fn outside(input: &Input) -> Option<Warning> {
-    beyond_two_edges(input).or_else(|| far_outside(input))
-}
-
-/// Points that fill an image from its upper left corner, and a larger one than the size that was given.
-fn beyond_two_edges(input: &Input) -> Option<Warning> {
-    let (mut sized, mut beyond) = (0usize, 0usize);
-    for k in 0..input.observation_count() {
-        let Some(size) = input.views()[input.view_of(k)].size else { continue };
-        let [x, y] = input.point_px(k);
-        if x.min(y) < -EDGE_PX {
-            return None;
-        }
-        sized += 1;
-        beyond += usize::from(x > f64::from(size.width_px) + EDGE_PX || y > f64::from(size.height_px) + EDGE_PX);
-    }
-    let share = beyond as f64 / sized.max(1) as f64;
-    (share > BEYOND_TWO_EDGES).then(|| {
-        let detail = format!(
-            "{:.0} % of the points lie beyond the right or lower edge of their image and none beyond the others: is the \
-             size that was given that of these images, and are width and height in their places?",
-            100.0 * share
-        );
-        Warning::new(WarningCode::PointsOutsideImage, detail)
-    })
-}
-
-/// Points that no image of such a size could show.
-fn far_outside(input: &Input) -> Option<Warning> {
-    let of = |k: usize| {
-        let size = input.views()[input.view_of(k)].size?;
-        let offset = Vector2::from(input.point_px(k)) - image_centre(size);
-        Some(offset.amax() / f64::from(size.width_px.max(size.height_px)))
-    };
-    let mut offsets: Vec<f64> = (0..input.observation_count()).filter_map(of).collect();
-    (median(&mut offsets) > MEDIAN_WITHIN).then(|| {
-        let detail = "half of the points lie farther from the middle of their image than it is long: is the size that was \
-                      given that of these images, or of a reduced copy?";
-        Warning::new(WarningCode::PointsOutsideImage, detail)
-    })
 }
 
 /// Centre of an image whose top-left pixel's centre is (0, 0).
@@ -124,28 +69,6 @@ fn extent_of_unsized(input: &Input) -> [Vector2<f64>; 2] {
 mod tests {
     use super::*;
     use crate::domain::{Limits, RawInput, View};
-
-    #[test]
-    fn an_image_size_that_does_not_hold_the_points_is_doubted() {
-        let codes = |width_px: u32, height_px: u32| {
-            let raw = RawInput {
-                views: vec![View { size: Some(ImageSize { width_px, height_px }), ..View::default() }; 3],
-                track_count: 10,
-                view: (0..30).map(|k| k % 3).collect(),
-                track: (0..30).map(|k| k / 3).collect(),
-                x: (0..30).map(|k| 30.0 * f64::from(k)).collect(),
-                y: (0..30).map(|k| 20.0 * f64::from(k)).collect(),
-                ..RawInput::default()
-            };
-            let input = Input::new(raw, &Limits::default(), "points").expect("valid");
-            normalization(&input).1.iter().map(|warning| warning.code).collect::<Vec<_>>()
-        };
-        assert_eq!(codes(880, 600), []);
-        // A reduced copy, and exchanged sides.
-        for (width, height) in [(440, 300), (220, 150), (600, 880)] {
-            assert_eq!(codes(width, height), [WarningCode::PointsOutsideImage], "{width} x {height}");
-        }
-    }
 
     #[test]
     fn views_of_unknown_size_share_one_centre() {
