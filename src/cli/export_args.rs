@@ -69,6 +69,14 @@ impl ExportArgs {
             tell!("warning: {refused}");
             exports.retain(|&export| !refused.has(export));
         }
+        let models: Vec<&str> =
+            exports.iter().filter(|&&export| export != Export::ColmapDatabase).map(|export| export.folder()).collect();
+        if solution.is_without_depth() && !models.is_empty() {
+            tell!(
+                "warning: {}: the camera only turned, so that there is no depth: no points, and all cameras in one place",
+                models.join(", ")
+            );
+        }
         Ok(exports)
     }
 }

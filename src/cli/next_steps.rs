@@ -4,7 +4,7 @@ use std::path::Path;
 
 use super::shell::quoted;
 use crate::domain::job::Summary;
-use crate::domain::{Grade, Solution, Status, Warning, WarningCode};
+use crate::domain::{Grade, Solution, Status, VERIFIED, Warning, WarningCode};
 use crate::formats::{Export, Format, result_files};
 
 /// Warnings that can be why a result is less than METRIC, the most probable cause first, each with what would help. A
@@ -12,12 +12,13 @@ use crate::formats::{Export, Format, result_files};
 const REMEDIES: [(WarningCode, &str); 15] = [
     (
         WarningCode::PointsOutsideImage,
-        "give the size of the images in which the points were measured (--width, --height)",
+        "give points in pixels from the upper left corner, and the size of the images in which they were measured \
+         (--width, --height)",
     ),
     (
         WarningCode::ModelMismatch,
         "if the camera zoomed, use --focal-per-view; if there were several cameras, give each its own camera group \
-         (--view-table); otherwise check the tracks, and the focal lengths that were given (--focal-px)",
+         (--view-table); otherwise check the tracks",
     ),
     (WarningCode::Cheirality, "check the order of the views and the size of the images (--width, --height)"),
     (WarningCode::LittleMotion, "add views that are taken from farther apart and in other directions"),
@@ -47,6 +48,13 @@ const REMEDIES: [(WarningCode, &str); 15] = [
 const MORE_VIEWS: &str =
     "add views between which the camera turned and tilted, or give the focal length (--focal-px, --focal-sigma)";
 
+/// What helps where a focal length that was given contradicts the tracks or another one.
+const CHECK_FOCAL: &str = "check the focal length that was given (--focal-px, --view-table, the cameras of COLMAP); it is in pixels, not in mm";
+
+/// What a calibration of views without depth is good for.
+const NO_DEPTH: &str = "the camera only turned: calibration and rotations are those of a panorama; there is no depth, so \
+    that there are no points and nothing to reconstruct densely";
+
 /// What of a result the sentences depend on.
 #[derive(Debug, Clone, Copy)]
 pub struct Outcome<'a> {
@@ -55,19 +63,31 @@ pub struct Outcome<'a> {
     warnings: &'a [Warning],
     /// Whether every view has a focal length of its own.
     has_own_focals: bool,
+    /// Whether the input has fewer views than a reconstruction needs.
+    has_too_few_views: bool,
+    /// Whether there is a calibration without depth.
+    is_without_depth: bool,
 }
 
 impl<'a> From<&'a Solution> for Outcome<'a> {
     fn from(solution: &'a Solution) -> Self {
         let Solution { status, grade, ref warnings, .. } = *solution;
-        Self { status, grade, warnings, has_own_focals: solution.view_focals_px().is_some() }
+        Self {
+            status,
+            grade,
+            warnings,
+            has_own_focals: solution.view_focals_px().is_some(),
+            has_too_few_views: solution.views.len() < VERIFIED,
+            is_without_depth: solution.is_without_depth(),
+        }
     }
 }
 
 impl<'a> From<&'a Summary> for Outcome<'a> {
     fn from(summary: &'a Summary) -> Self {
         let Summary { status, grade, ref warnings, .. } = *summary;
-        Self { status, grade, warnings, has_own_focals: false }
+        // What else there is to say is said of the files, which are with the solution.
+        Self { status, grade, warnings, has_own_focals: false, has_too_few_views: false, is_without_depth: false }
     }
 }
 
@@ -95,13 +115,23 @@ pub fn steps(outcome: Outcome, files: &Files) -> Vec<String> {
     [Some(look), elsewhere(outcome, files), advice(outcome)].into_iter().flatten().collect()
 }
 
-/// What would make the result better, and why it is not; `None` where it is good.
+/// What would make the result better, and why it is not; `None` where it is good, and no given focal length contradicts
+/// it.
 pub fn advice(outcome: Outcome) -> Option<String> {
     let found = match (outcome.status, outcome.grade) {
         (Status::NoReconstruction, _) => "NO_RECONSTRUCTION",
-        (_, Some(grade @ (Grade::Weak | Grade::ProjectiveOnly))) => grade.name(),
+        (_, Some(grade)) => grade.name(),
         _ => return None,
     };
+    if outcome.warnings.iter().any(Warning::doubts_focal_prior) {
+        return Some(format!("{found} with {}: {CHECK_FOCAL}", WarningCode::ModelMismatch.name()));
+    }
+    if outcome.grade == Some(Grade::Metric) {
+        return None;
+    }
+    if outcome.has_too_few_views {
+        return Some(format!("{found}: add views; a reconstruction needs at least {VERIFIED}"));
+    }
     let has = |code| outcome.warnings.iter().any(|warning| warning.code == code);
     Some(match REMEDIES.iter().find(|(code, _)| has(*code)) {
         Some((code, remedy)) => format!("{found} because of {}: {remedy}", code.name()),
@@ -117,6 +147,9 @@ fn elsewhere(outcome: Outcome, files: &Files) -> Option<String> {
         return None;
     }
     let is_metric = matches!(outcome.grade, Some(Grade::Metric | Grade::Weak));
+    if outcome.is_without_depth {
+        return Some(NO_DEPTH.into());
+    }
     let folder = |export: Export| {
         let path = files.directory.join(export.folder());
         files.exports.contains(&export).then(|| quoted(&path.to_string_lossy()))
@@ -156,7 +189,7 @@ mod tests {
 
     fn outcome(grade: Option<Grade>, warnings: &[Warning]) -> Outcome<'_> {
         let status = if grade.is_some() { Status::Solved } else { Status::NoReconstruction };
-        Outcome { status, grade, warnings, has_own_focals: false }
+        Outcome { status, grade, warnings, has_own_focals: false, has_too_few_views: false, is_without_depth: false }
     }
 
     fn files<'a>(exports: &'a [Export], format: Option<Format>) -> Files<'a> {
@@ -198,8 +231,40 @@ mod tests {
     }
 
     #[test]
+    fn a_focal_length_that_the_tracks_contradict_is_checked_first() {
+        let contradicted = "the tracks alone give a focal length of 800.0 px, 20.0 standard deviations from the 28.0 px \
+                            known beforehand";
+        let mismatch = |detail: &str| Warning::new(WarningCode::ModelMismatch, detail);
+        for grade in [Some(Grade::Metric), Some(Grade::Weak), Some(Grade::ProjectiveOnly), None] {
+            let warnings = [Warning::new(WarningCode::PointsOutsideImage, ""), mismatch(contradicted)];
+            let told = advice(outcome(grade, &warnings)).expect("advice");
+            assert!(told.ends_with(&format!(" with MODEL_MISMATCH: {CHECK_FOCAL}")), "{told}");
+        }
+        let zoomed = [mismatch("with a focal length a view (focal_per_view) the images fit better")];
+        assert_eq!(advice(outcome(Some(Grade::Metric), &zoomed)), None);
+        let weak = advice(outcome(Some(Grade::Weak), &zoomed)).expect("advice");
+        assert!(weak.contains("if the camera zoomed"), "{weak}");
+    }
+
+    #[test]
+    fn views_without_depth_go_nowhere() {
+        let turned = Outcome { is_without_depth: true, ..outcome(Some(Grade::Metric), &[]) };
+        for exports in [&[][..], &[Export::Colmap], &[Export::Nerfstudio], &[Export::ColmapDatabase]] {
+            let told = steps(turned, &files(exports, Some(Format::ColmapDatabase)));
+            assert_eq!(told[1..], [NO_DEPTH], "{exports:?}");
+        }
+    }
+
+    #[test]
+    fn two_views_are_too_few() {
+        let warnings = [Warning::new(WarningCode::NoConsensus, "2 views given")];
+        let two = Outcome { has_too_few_views: true, ..outcome(None, &warnings) };
+        assert_eq!(advice(two).as_deref(), Some("NO_RECONSTRUCTION: add views; a reconstruction needs at least 3"));
+    }
+
+    #[test]
     fn an_option_that_is_advised_is_one_of_solve_and_of_submit() {
-        let texts = REMEDIES.iter().map(|(_, remedy)| *remedy).chain([MORE_VIEWS, "--focal-per-view"]);
+        let texts = REMEDIES.iter().map(|(_, remedy)| *remedy).chain([MORE_VIEWS, CHECK_FOCAL, "--focal-per-view"]);
         let words = texts.flat_map(|text| text.split(|c: char| !c.is_ascii_alphanumeric() && c != '-'));
         let options: Vec<&str> = words.filter_map(|word| word.strip_prefix("--")).collect();
         assert!(options.len() > 10, "{options:?}");

@@ -143,6 +143,123 @@ fn wrong_usage_ends_with_2_and_does_nothing() {
 }
 
 #[test]
+fn wrong_usage_is_told_by_its_flag() {
+    let directory = directory();
+    let input = scene(directory.path());
+    let (input, out) = (text(&input), directory.path().join("out"));
+    let solve: [(&[&str], &str); 14] = [
+        (&["--noise-px", "-1"], "--noise-px: -1 is not a positive finite number"),
+        (&["--alpha", "nan"], "--alpha: NaN is not"),
+        (&["--network-width", "100"], "--network-width: 100 is above"),
+        (&["--epipolar-depths"], "--epipolar-depths is of use with --method paper, scpsfm, psfm only"),
+        (&["--kappa", "2"], "--kappa is of use with --method paper only"),
+        (&["--method", "geometry", "--alpha", "1"], "--alpha is of use with --method auto, paper, scpsfm only"),
+        (&["--method", "geometry", "--network-width", "0.5"], "--network-width is of use with"),
+        (&["--method", "psfm", "--iterations", "9"], "--iterations is of use with"),
+        (&["--method", "psfm", "--no-daq"], "--no-daq is of use with"),
+        (&["--focal-px", "900", "--focal-per-view"], "'--focal-px <PX>' cannot be used with '--focal-per-view'"),
+        (&["--width", "99999999", "--height", "99999999"], "'--width <PX>': no image has more than 1000000 px"),
+        (&["--seed", "-1"], "is not a whole number >= 0"),
+        (&["--window", "3", "--export", "colmap"], "--export"),
+        (&["--threads", "0"], "--threads"),
+    ];
+    for (flags, words) in solve {
+        let refused = run(["solve", input, "--out", text(&out)].iter().chain(flags));
+        assert_eq!(refused.code, Some(2), "{flags:?}: {refused:?}");
+        assert!(refused.stderr.contains(words), "{words:?} is not in {refused:?}");
+    }
+    let others: [(&[&str], &str); 7] = [
+        (&["synth", "--out", text(&out), "--focal-px", "5"], "--focal-px: 5.0 px is not within 100..=100000 px"),
+        (&["synth", "--out", text(&out), "--wrong-views", "11"], "--wrong-views: "),
+        (&["synth", "--out", text(&out), "--views", "-1"], "is not a whole number >= 0"),
+        (&["synth", "--out", text(&out), "--sequence", "--ramp"], "--zoom"),
+        (&["watch", "a", "--after", "-1"], "is not a whole number >= 0"),
+        (&["evaluate", "--photographed", "--out", text(&out), "--first-seed", "-1"], "is not a whole number >= 0"),
+        (&["evaluate", "--out", text(&out), "--seeds", "0"], "is not in 1..=10000"),
+    ];
+    for (arguments, words) in others {
+        let refused = run(arguments);
+        assert_eq!(refused.code, Some(2), "{arguments:?}: {refused:?}");
+        assert!(refused.stderr.contains(words), "{words:?} is not in {refused:?}");
+    }
+    assert!(!out.exists());
+}
+
+#[test]
+fn wrong_focal_lengths_and_coordinates_are_what_is_advised_first() {
+    let directory = directory();
+    let out = directory.path().join("out");
+    let size = ["--width", "1000", "--height", "1000"];
+    let solved = |input: &Path, more: &[&str]| {
+        let solved = run(["solve", text(input), "--out", text(&out)].iter().chain(&size).chain(more));
+        assert_eq!(solved.code, Some(0), "{solved:?}");
+        solved
+    };
+    let walk = directory.path().join("walk");
+    let made = ["synth", "--sequence", "--views", "8", "--tracks", "120", "--outliers", "0.2", "--out", text(&walk)];
+    assert_eq!(run(made).code, Some(0));
+    let input = walk.join("observations.csv");
+    let good = solved(&input, &[]);
+    assert!(!good.stderr.contains("millimetres") && !good.stdout.contains("POINTS_OUTSIDE_IMAGE"), "{good:?}");
+    let millimetres = solved(&input, &["--focal-px", "28", "--focal-sigma", "10"]);
+    assert!(millimetres.stderr.contains("is it in millimetres?"), "{millimetres:?}");
+    assert!(millimetres.stderr.contains("of sigma 10 says next to nothing"), "{millimetres:?}");
+    let contradicted = solved(&input, &["--focal-px", "28"]);
+    assert!(contradicted.stdout.contains(" with MODEL_MISMATCH: check the focal length that was"), "{contradicted:?}");
+
+    let table = fs::read_to_string(&input).expect("the scene");
+    let centred = table.lines().map(|line| {
+        let numbers: Vec<f64> = line.split(',').filter_map(|number| number.parse().ok()).collect();
+        let &[view, track, x, y] = numbers.as_slice() else { return line.to_owned() };
+        format!("{view},{track},{},{}", x - 499.5, 499.5 - y)
+    });
+    let moved = walk.join("centred.csv");
+    fs::write(&moved, centred.collect::<Vec<_>>().join("\n")).expect("written");
+    let told = solved(&moved, &[]).stdout;
+    assert!(told.contains("POINTS_OUTSIDE_IMAGE: ") && told.contains("measured from the image centre?"), "{told}");
+}
+
+#[test]
+fn a_camera_that_only_turned_is_no_scene_for_other_programs() {
+    let directory = directory();
+    let (turn, out) = (directory.path().join("turn"), directory.path().join("out"));
+    let made = ["synth", "--motion", "pure-rotation", "--outliers", "0.2", "--tracks", "100", "--out", text(&turn)];
+    assert_eq!(run(made).code, Some(0));
+    let input = turn.join("observations.csv");
+    let size = ["--width", "1000", "--height", "1000", "--export", "colmap,bal", "--out", text(&out)];
+    let solved = run(["solve", text(&input)].iter().chain(&size));
+    assert!(solved.stdout.contains("METRIC") && solved.stdout.contains("PURE_ROTATION"), "{solved:?}");
+    assert!(solved.stderr.contains("warning: colmap, bal: the camera only turned"), "{solved:?}");
+    assert!(solved.stdout.contains("no depth") && !solved.stdout.contains("image_undistorter"), "{solved:?}");
+}
+
+#[test]
+fn fewer_than_three_views_are_told_one_minimum() {
+    let directory = directory();
+    let (two, out) = (directory.path().join("two"), directory.path().join("out"));
+    let made = ["synth", "--views", "2", "--tracks", "40", "--outliers", "0", "--out", text(&two)];
+    assert_eq!(run(made).code, Some(0));
+    let input = two.join("observations.csv");
+    let solve = |input: &Path| run(["solve", text(input), "--out", text(&out)]);
+    let of_two = solve(&input);
+    assert_eq!(of_two.code, Some(3), "{of_two:?}");
+    assert!(of_two.stdout.contains("NO_RECONSTRUCTION: add views; a reconstruction needs at least 3"), "{of_two:?}");
+    let table = fs::read_to_string(&input).expect("the scene");
+    let of_one = |line: &&str| !line.starts_with("1,");
+    let one = two.join("one.csv");
+    fs::write(&one, table.lines().filter(of_one).collect::<Vec<_>>().join("\n")).expect("written");
+    let of_one = solve(&one);
+    assert_eq!(of_one.code, Some(65), "{of_one:?}");
+    assert!(of_one.stderr.contains("1 view given; a reconstruction needs at least 3"), "{of_one:?}");
+
+    // What a solve wrote is no input.
+    let answer = solve(&out.join("observations.csv"));
+    assert!(answer.code == Some(65) && answer.stderr.contains("an answer and no input"), "{answer:?}");
+    let answer = solve(&out);
+    assert!(answer.code == Some(65) && answer.stderr.contains("is the directory of an answer"), "{answer:?}");
+}
+
+#[test]
 fn a_bad_input_ends_with_65_and_names_file_and_line() {
     let directory = directory();
     let good = fs::read_to_string(scene(directory.path())).expect("the scene");

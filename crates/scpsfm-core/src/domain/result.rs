@@ -10,7 +10,7 @@ use super::left_out::{self, LeftOut};
 use super::progress::{Progress, Stage};
 use super::second_structure::SecondStructure;
 use super::settings::{Method, Proposal};
-use super::warning::Warning;
+use super::warning::{Warning, WarningCode};
 
 /// Observations from which on a track may be verified: two make a point, and one more verifies it.
 pub const VERIFIED: usize = 3;
@@ -354,6 +354,12 @@ impl Solution {
         let mut own = self.views.iter().filter_map(|view| view.focal_px).filter(|px| px.is_finite());
         let first = own.next()?;
         Some(own.fold((first, first), |(low, high), px| (low.min(px), high.max(px))))
+    }
+
+    /// Whether it is metric and shows no depth: the camera only turned, and the tracks have no points.
+    pub fn is_without_depth(&self) -> bool {
+        let turned = self.warnings.iter().any(|warning| warning.code == WarningCode::PureRotation);
+        turned && self.is_metric() && self.tracks.point.iter().all(Option::is_none)
     }
 
     /// Whether there is a metric reconstruction. Without one (above all under [`Grade::ProjectiveOnly`]) no calibration

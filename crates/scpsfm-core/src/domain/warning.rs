@@ -38,7 +38,7 @@ pub enum WarningCode {
     ViewsLeftOut,
     /// No image size was given; the extent of the points stood in.
     AssumedImageSize,
-    /// Most points lie far outside the image size that was given: that of other images, or of a reduced copy.
+    /// The points do not lie as pixels of images of the given size do: see [`super::image_fit`].
     PointsOutsideImage,
     /// Views of several camera groups or sizes were treated as one camera.
     CameraGroupsMerged,
@@ -123,6 +123,14 @@ pub struct Warning {
 impl Warning {
     pub fn new(code: WarningCode, detail: impl Into<String>) -> Self {
         Self { code, detail: detail.into(), camera_group: None }
+    }
+
+    /// Whether it says that a focal length known beforehand contradicts the tracks or another such.
+    ///
+    /// The code has other causes too, and results of earlier versions have nothing but the words.
+    pub fn doubts_focal_prior(&self) -> bool {
+        let words = [" px known beforehand", "the focal lengths that were given for views of one camera contradict"];
+        self.code == WarningCode::ModelMismatch && words.iter().any(|words| self.detail.contains(words))
     }
 
     /// The same of one camera group.
