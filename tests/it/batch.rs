@@ -26,7 +26,8 @@ fn several_inputs_are_several_jobs_or_none() {
     let names: Vec<&str> = both.stdout.lines().collect();
     for (name, tracks) in names.iter().zip([3, 4]) {
         let got = run(["get", name, "--server", &server.grpc]);
-        assert!(got.stdout.contains(&format!("2 views, {tracks} tracks")), "{got:?}");
+        let line = got.stdout.lines().next().unwrap_or_default();
+        assert!(line.contains(&format!("2 views, {tracks} tracks")) && line.ends_with("  of=both"), "{got:?}");
     }
     assert_eq!(names.len(), 2);
     let again = submit(&[&a, &b, "--request-id", "r", "--label", "of=both"]);
