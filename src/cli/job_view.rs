@@ -77,8 +77,15 @@ pub fn job_line(job: &Job) -> String {
     if job.priority != 0 {
         line.push_str(&format!("  priority {}", job.priority));
     }
-    job.labels.iter().for_each(|(key, value)| line.push_str(&format!("  {key}={value}")));
+    job.labels.iter().for_each(|(key, value)| line.push_str(&format!("  {key}={}", label(value))));
     line
+}
+
+/// A value as it is where that is one plain word, else quoted and escaped: other clients wrote it, and it must not break
+/// the line or reach the terminal.
+fn label(value: &str) -> String {
+    let is_plain = |c: char| c.is_alphanumeric() || "-_./:@+".contains(c);
+    if !value.is_empty() && value.chars().all(is_plain) { value.to_owned() } else { format!("{value:?}") }
 }
 
 fn summary_words(summary: &Summary) -> String {
@@ -365,6 +372,12 @@ mod tests {
         assert!(of("jobs/a", None).is_err());
         assert!(of("tenants/-/inputs/a", None).is_err());
         assert!(of("tenants/-/jobs/", None).is_err());
+    }
+
+    #[test]
+    fn labels_of_others_neither_break_the_line_nor_reach_the_terminal() {
+        let shown = ["north", "v1.2:a/b", "Zürich", "", "a b", "x\ny", "\u{1b}[2J"].map(label);
+        assert_eq!(shown, ["north", "v1.2:a/b", "Zürich", "\"\"", "\"a b\"", "\"x\\ny\"", "\"\\u{1b}[2J\""]);
     }
 
     #[test]

@@ -24,7 +24,7 @@ pub struct Args {
     #[command(flatten)]
     pub server: ServerArgs,
 
-    /// Only jobs in one of these states, in lower or upper case
+    /// Only jobs in one of these states, in lower or upper case; may be repeated
     #[arg(long = "state", value_enum, ignore_case = true, value_delimiter = ',')]
     pub states: Vec<JobState>,
 

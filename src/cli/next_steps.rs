@@ -4,12 +4,17 @@ use std::path::Path;
 
 use super::shell::quoted;
 use crate::domain::job::Summary;
-use crate::domain::{Grade, Solution, Status, VERIFIED, Warning, WarningCode};
+use crate::domain::{Grade, LEAST_VIEWS, Solution, Status, Warning, WarningCode};
 use crate::formats::{Export, Format, result_files};
 
 /// Warnings that can be why a result is less than METRIC, the most probable cause first, each with what would help. A
 /// wrong size or a wrong model comes before what the views show under it.
-const REMEDIES: [(WarningCode, &str); 15] = [
+const REMEDIES: [(WarningCode, &str); 16] = [
+    (
+        WarningCode::FocalPriorContradicted,
+        "check the focal length that was given (--focal-px, --view-table, the cameras of COLMAP); it is in pixels, not in \
+         mm",
+    ),
     (
         WarningCode::PointsOutsideImage,
         "give points in pixels from the upper left corner, and the size of the images in which they were measured \
@@ -48,9 +53,6 @@ const REMEDIES: [(WarningCode, &str); 15] = [
 const MORE_VIEWS: &str =
     "add views between which the camera turned and tilted, or give the focal length (--focal-px, --focal-sigma)";
 
-/// What helps where a focal length that was given contradicts the tracks or another one.
-const CHECK_FOCAL: &str = "check the focal length that was given (--focal-px, --view-table, the cameras of COLMAP); it is in pixels, not in mm";
-
 /// What a calibration of views without depth is good for.
 const NO_DEPTH: &str = "the camera only turned: calibration and rotations are those of a panorama; there is no depth, so \
     that there are no points and nothing to reconstruct densely";
@@ -77,7 +79,7 @@ impl<'a> From<&'a Solution> for Outcome<'a> {
             grade,
             warnings,
             has_own_focals: solution.view_focals_px().is_some(),
-            has_too_few_views: solution.views.len() < VERIFIED,
+            has_too_few_views: solution.views.len() < LEAST_VIEWS,
             is_without_depth: solution.is_without_depth(),
         }
     }
@@ -123,16 +125,13 @@ pub fn advice(outcome: Outcome) -> Option<String> {
         (_, Some(grade)) => grade.name(),
         _ => return None,
     };
-    if outcome.warnings.iter().any(Warning::doubts_focal_prior) {
-        return Some(format!("{found} with {}: {CHECK_FOCAL}", WarningCode::ModelMismatch.name()));
-    }
-    if outcome.grade == Some(Grade::Metric) {
+    let has = |code| outcome.warnings.iter().any(|warning| warning.code == code);
+    if outcome.grade == Some(Grade::Metric) && !has(WarningCode::FocalPriorContradicted) {
         return None;
     }
     if outcome.has_too_few_views {
-        return Some(format!("{found}: add views; a reconstruction needs at least {VERIFIED}"));
+        return Some(format!("{found}: add views; a reconstruction needs at least {LEAST_VIEWS}"));
     }
-    let has = |code| outcome.warnings.iter().any(|warning| warning.code == code);
     Some(match REMEDIES.iter().find(|(code, _)| has(*code)) {
         Some((code, remedy)) => format!("{found} because of {}: {remedy}", code.name()),
         None if has(WarningCode::Unknown) => format!("{found}: the server is newer, and its warnings may say why"),
@@ -232,15 +231,13 @@ mod tests {
 
     #[test]
     fn a_focal_length_that_the_tracks_contradict_is_checked_first() {
-        let contradicted = "the tracks alone give a focal length of 800.0 px, 20.0 standard deviations from the 28.0 px \
-                            known beforehand";
-        let mismatch = |detail: &str| Warning::new(WarningCode::ModelMismatch, detail);
+        let of = |code| Warning::new(code, "");
+        let warnings = [of(WarningCode::PointsOutsideImage), of(WarningCode::FocalPriorContradicted)];
         for grade in [Some(Grade::Metric), Some(Grade::Weak), Some(Grade::ProjectiveOnly), None] {
-            let warnings = [Warning::new(WarningCode::PointsOutsideImage, ""), mismatch(contradicted)];
             let told = advice(outcome(grade, &warnings)).expect("advice");
-            assert!(told.ends_with(&format!(" with MODEL_MISMATCH: {CHECK_FOCAL}")), "{told}");
+            assert!(told.contains(" because of FOCAL_PRIOR_CONTRADICTED: check the focal length"), "{told}");
         }
-        let zoomed = [mismatch("with a focal length a view (focal_per_view) the images fit better")];
+        let zoomed = [of(WarningCode::ModelMismatch)];
         assert_eq!(advice(outcome(Some(Grade::Metric), &zoomed)), None);
         let weak = advice(outcome(Some(Grade::Weak), &zoomed)).expect("advice");
         assert!(weak.contains("if the camera zoomed"), "{weak}");
@@ -264,7 +261,7 @@ mod tests {
 
     #[test]
     fn an_option_that_is_advised_is_one_of_solve_and_of_submit() {
-        let texts = REMEDIES.iter().map(|(_, remedy)| *remedy).chain([MORE_VIEWS, CHECK_FOCAL, "--focal-per-view"]);
+        let texts = REMEDIES.iter().map(|(_, remedy)| *remedy).chain([MORE_VIEWS, "--focal-per-view"]);
         let words = texts.flat_map(|text| text.split(|c: char| !c.is_ascii_alphanumeric() && c != '-'));
         let options: Vec<&str> = words.filter_map(|word| word.strip_prefix("--")).collect();
         assert!(options.len() > 10, "{options:?}");

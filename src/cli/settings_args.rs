@@ -122,7 +122,8 @@ impl SettingsArgs {
         ];
         match flags.into_iter().find(|(_, is_given, methods)| *is_given && !methods.contains(&self.method)) {
             Some((flag, _, methods)) => {
-                let names: Vec<String> = methods.iter().map(|&of| Method::from(of).name().to_lowercase()).collect();
+                let values = methods.iter().filter_map(MethodArg::to_possible_value);
+                let names: Vec<String> = values.map(|value| value.get_name().to_owned()).collect();
                 Err(Failure::usage(format_args!("{flag} is of use with --method {} only", names.join(", "))))
             }
             None => Ok(()),

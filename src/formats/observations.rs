@@ -15,8 +15,8 @@ use crate::domain::{ImageSize, Limits, RawInput, View, counted};
 const REQUIRED: [&str; 4] = ["view", "track", "x", "y"];
 const DEPTH: &str = "depth";
 const SIGMA: &str = "sigma";
-/// A column of the tables that a solve writes, and of no input.
-const OF_ANSWERS: &str = "inlier";
+/// Columns of the table of observations that a solve writes, and of no input.
+const OF_ANSWERS: [&str; 2] = ["inlier", "x_px"];
 /// Unknown columns that a note names.
 const MOST_NAMED: usize = 5;
 
@@ -145,7 +145,7 @@ fn header(text: &str) -> Result<Columns, String> {
     for (place, wanted) in required.iter_mut().zip(REQUIRED) {
         *place = find(wanted)?.ok_or_else(|| {
             let quoted = quote(text);
-            if names.iter().any(|name| name == OF_ANSWERS) {
+            if OF_ANSWERS.iter().all(|of_answers| names.iter().any(|name| name == of_answers)) {
                 "this is a table that a solve wrote, an answer and no input: give the file that was solved".into()
             } else if names.iter().all(|name| name.parse::<f64>().is_ok()) {
                 format!("no header; the first line must be `view,track,x,y[,depth][,sigma]`, not {quoted}")

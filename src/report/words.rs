@@ -25,7 +25,10 @@ pub fn warning(code: WarningCode) -> &'static str {
         }
         WarningCode::SecondMinimum => "Another calibration explains the tracks about as well as the one shown.",
         WarningCode::ModelMismatch => {
-            "The cameras are not what the calibration takes them to be: expect several cameras, a zoom, a lens that no model here describes, or focal lengths that were given wrong."
+            "The cameras are not what the calibration takes them to be: expect several cameras, a zoom, or a lens that no model here describes."
+        }
+        WarningCode::FocalPriorContradicted => {
+            "A focal length that was given contradicts the tracks, or another one that was given."
         }
         WarningCode::FewInliers => "So few tracks agree that the result can hardly be verified.",
         WarningCode::PrincipalPointUnobservable => {
@@ -39,7 +42,7 @@ pub fn warning(code: WarningCode) -> &'static str {
             "No image size was given, so the extent of the points stood in; the principal point may be off."
         }
         WarningCode::PointsOutsideImage => {
-            "The points do not lie as pixels of images of the given size do; with a wrong size the calibration is wrong."
+            "The points do not lie as pixels of the images do; with a wrong size or origin the calibration is wrong."
         }
         WarningCode::CameraGroupsMerged => "Views of different cameras or sizes were treated as one camera.",
         WarningCode::UnverifiedRanking => {

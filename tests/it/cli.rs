@@ -205,7 +205,10 @@ fn wrong_focal_lengths_and_coordinates_are_what_is_advised_first() {
     assert!(millimetres.stderr.contains("is it in millimetres?"), "{millimetres:?}");
     assert!(millimetres.stderr.contains("of sigma 10 says next to nothing"), "{millimetres:?}");
     let contradicted = solved(&input, &["--focal-px", "28"]);
-    assert!(contradicted.stdout.contains(" with MODEL_MISMATCH: check the focal length that was"), "{contradicted:?}");
+    assert!(
+        contradicted.stdout.contains(" because of FOCAL_PRIOR_CONTRADICTED: check the focal length that was"),
+        "{contradicted:?}"
+    );
 
     let table = fs::read_to_string(&input).expect("the scene");
     let centred = table.lines().map(|line| {

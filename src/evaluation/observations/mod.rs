@@ -126,12 +126,12 @@ pub struct Measured {
     pub failure: Option<String>,
     /// Largest Cramer-Rao bound of the log focal lengths, where it is known.
     pub bound: Option<f64>,
-    /// Observations that were kept, that shall be, views that shall be registered, and how many of these right
-    /// observations connect.
+    /// Observations that were kept, that shall be, and views that shall be registered.
     pub kept: usize,
     pub wanted: usize,
     pub due: usize,
-    pub connected: usize,
+    /// Share of these views that right observations connect, at most.
+    pub connected: f64,
     /// Observations of the input.
     pub given: usize,
     /// Absolute trajectory error of the largest reconstruction over the length of the true path, where it is metric and

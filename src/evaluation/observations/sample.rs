@@ -65,7 +65,8 @@ impl Generator {
                 let places = input.view.iter().copied().zip(input.track.iter().copied()).zip(&wanted);
                 let seen: Vec<(u32, u32)> = places.filter(|(_, wanted)| **wanted).map(|(place, _)| place).collect();
                 let sets = connected_views(&seen, due.len()).into_iter();
-                let connected = sets.map(|set| set.iter().filter(|&&view| due[view]).count()).max().unwrap_or(0);
+                let largest = sets.map(|set| set.iter().filter(|&&view| due[view]).count()).max().unwrap_or(0);
+                let connected = largest as f64 / due.iter().filter(|&&due| due).count().max(1) as f64;
                 let centres = Some(truth.centres());
                 let right = truth.observation_right;
                 let sample = Sample::new(IMAGE_SIZE, input, truth.inlier, right, truth.focals_px);
@@ -89,8 +90,8 @@ pub struct Sample {
     pub wanted: Vec<bool>,
     /// Whether a view shall be registered.
     pub due: Vec<bool>,
-    /// How many of these views right observations connect, at most.
-    pub connected: usize,
+    /// Share of these views that right observations connect, at most.
+    pub connected: f64,
     /// True focal length of each view.
     pub focals_px: Vec<f64>,
     /// Cramer-Rao bound of the standard deviation of each view's log focal length, where it is known.
@@ -104,8 +105,7 @@ impl Sample {
     fn new(size: ImageSize, input: RawInput, inlier: Vec<bool>, right: Vec<bool>, focals_px: Vec<f64>) -> Self {
         let wanted = right.iter().zip(&input.track).map(|(&right, &k)| right && inlier[k as usize]).collect();
         let due = vec![true; input.views.len()];
-        let connected = due.len();
-        Self { size, due, connected, input, inlier, right, wanted, focals_px, bounds: None, centres: None }
+        Self { size, due, connected: 1.0, input, inlier, right, wanted, focals_px, bounds: None, centres: None }
     }
 
     /// True focal length of each view and the bound of its estimate.

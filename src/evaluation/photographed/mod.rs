@@ -170,7 +170,7 @@ impl Row {
             precision: mean(here.iter().filter(|measured| measured.kept > 0).map(|measured| measured.precision)),
             recall: mean(wanted().map(|measured| measured.recall)),
             views: mean(due().map(|measured| measured.views)),
-            connected: mean(due().map(|measured| measured.connected as f64 / measured.due as f64)),
+            connected: mean(due().map(|measured| measured.connected)),
             second_structure: mean(ours().map(|measured| f64::from(measured.second_structure))),
             seconds: mean(here.iter().map(|measured| measured.seconds)).unwrap_or(0.0),
             failures: here.iter().filter_map(|measured| measured.failure.clone()).collect(),

@@ -10,7 +10,7 @@ fn answer(grade: Option<Grade>, log_errors: &[f64], bound: Option<f64>) -> Measu
         kept: 10,
         wanted: 10,
         due: 3,
-        connected: 3,
+        connected: 1.0,
         precision: 1.0,
         recall: 0.5,
         views: 1.0,
@@ -26,7 +26,7 @@ fn a_row_tells_refused_from_impossible_and_belied_from_covered() {
         answer(metric, &[0.005], Some(0.005)),
         answer(metric, &[0.035], Some(0.005)),
         Measured { second_structure: true, ..answer(metric, &[0.005, -0.05], Some(0.02)) },
-        Measured { connected: 0, ..answer(weak, &[0.02], None) },
+        Measured { connected: 0.0, ..answer(weak, &[0.02], None) },
         nothing,
     ];
     let row = Row::of("all", Side::Scpsfm, &answers.iter().collect::<Vec<_>>());

@@ -78,6 +78,7 @@ twins! {
         UnobservableFocal,
         SecondMinimum,
         ModelMismatch,
+        FocalPriorContradicted,
         FewInliers,
         PrincipalPointUnobservable,
         Cheirality,

@@ -188,7 +188,7 @@ impl dyn Connection + '_ {
              (SELECT COUNT(*) FROM jobs WHERE state = 'RUNNING') AS running, \
              (SELECT pause_time IS NOT NULL FROM queue) AS paused FROM jobs WHERE state = 'QUEUED'",
         );
-        measured(&self.row(select).await?)
+        queue_stats_of(&self.row(select).await?)
     }
 
     /// What waits of one tenant; what runs is not counted.
@@ -198,7 +198,7 @@ impl dyn Connection + '_ {
              CAST(COALESCE(SUM(observation_count), 0) AS BIGINT) AS observations, CAST(0 AS BIGINT) AS running, \
              FALSE AS paused FROM jobs WHERE state = 'QUEUED' AND tenant = $1",
         );
-        measured(&self.row(select.bind(tenant)).await?)
+        queue_stats_of(&self.row(select.bind(tenant)).await?)
     }
 }
 
@@ -210,7 +210,7 @@ pub(super) fn joined(chunks: &[Row]) -> Result<Vec<u8>, Error> {
     Ok(whole)
 }
 
-fn measured(row: &Row) -> Result<QueueStats, Error> {
+fn queue_stats_of(row: &Row) -> Result<QueueStats, Error> {
     Ok(QueueStats {
         queued: number(row, "queued")?,
         queued_bytes: number(row, "bytes")?,

@@ -36,7 +36,8 @@ pub(super) async fn measured<T>(
     result
 }
 
-/// Reads through a connection of its own; measured where the operation is named.
+/// Reads through a connection of its own; measured where the operation is named. `return` leaves the operation: its body
+/// is an asynchronous block.
 macro_rules! reads {
     ($database:expr, $operation:literal, $size:expr, |$connection:ident| $body:expr) => {
         $crate::store::sql::operation::measured($operation, async { reads!($database, $size, |$connection| $body) })

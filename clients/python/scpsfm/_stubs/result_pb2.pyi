@@ -62,6 +62,7 @@ class WarningCode(int, metaclass=_enum_type_wrapper.EnumTypeWrapper):
     WARNING_CODE_DUPLICATE_TRACKS: _ClassVar[WarningCode]
     WARNING_CODE_STATIC_TRACKS: _ClassVar[WarningCode]
     WARNING_CODE_LITTLE_MOTION: _ClassVar[WarningCode]
+    WARNING_CODE_FOCAL_PRIOR_CONTRADICTED: _ClassVar[WarningCode]
 
 class LeftOutReason(int, metaclass=_enum_type_wrapper.EnumTypeWrapper):
     __slots__ = ()
@@ -113,6 +114,7 @@ WARNING_CODE_UNVERIFIED_RANKING: WarningCode
 WARNING_CODE_DUPLICATE_TRACKS: WarningCode
 WARNING_CODE_STATIC_TRACKS: WarningCode
 WARNING_CODE_LITTLE_MOTION: WarningCode
+WARNING_CODE_FOCAL_PRIOR_CONTRADICTED: WarningCode
 LEFT_OUT_REASON_UNSPECIFIED: LeftOutReason
 LEFT_OUT_REASON_NO_OBSERVATIONS: LeftOutReason
 LEFT_OUT_REASON_OUTSIDE_BLOCK: LeftOutReason

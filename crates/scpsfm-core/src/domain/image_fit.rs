@@ -6,8 +6,8 @@ use super::{ImageSize, Input, Warning, WarningCode};
 options! {
     /// Thresholds of the suspicions. Shares are of the points in views whose size is known.
     pub struct ImageFitOptions {
-        /// Points from which on it counts where all of them lie, or that none lies elsewhere. Of 50 points anywhere in
-        /// an image none is beyond the middle, in x or in y, once in 1e30; of one small object it may be so.
+        /// Points from which on it counts where all of them lie, or that none lies elsewhere. Of ten tracks anywhere in
+        /// five images none is beyond the middle, in x or in y, once in a million; of one small object it may be so.
         least_points: usize = 50,
         /// Largest coordinate of points that are in no pixels: in units of the image they are within 1, in focal
         /// lengths within 2 up to 127 degrees of view. An image of 2 pixels shows nothing.
@@ -121,8 +121,8 @@ type Suspicion = (fn(&Layout, &ImageFitOptions) -> bool, fn(&Layout) -> String);
 const SUSPICIONS: [Suspicion; 5] = [
     (Layout::is_normalized, |layout| {
         format!(
-            "no coordinate is larger than {:.3}: these are no pixels; multiply what was divided by the image size by it, \
-             and what is in focal lengths by the focal length in pixels, and add the image centre",
+            "no coordinate is larger than {:.3}: these are no pixels. Multiply coordinates that were divided by the image \
+             size by that size; multiply those in focal lengths by the focal length in pixels, and add the image centre",
             layout.largest
         )
     }),
@@ -232,7 +232,7 @@ mod tests {
         for size in [None, Some(SIZE)] {
             for (unit, from) in [(900.0, 0.0), (900.0, 450.0), (700.0, 450.0)] {
                 let told = said(size, 4, |x, y| ((x - from) / unit, (y - from) / unit)).expect("normalised");
-                assert!(told.contains("these are no pixels; multiply"), "{told}");
+                assert!(told.contains("these are no pixels. Multiply"), "{told}");
             }
         }
     }

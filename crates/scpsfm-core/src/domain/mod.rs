@@ -32,7 +32,7 @@ pub use matches::{PairMatches, RawMatches};
 pub use progress::{
     HeadProgress, Losses, Observer, Phase, Progress, ReconstructionProgress, Silent, Stage, Step, Task,
 };
-pub use result::{Calibration, Grade, LensProjection, Solution, Status, VERIFIED};
+pub use result::{Calibration, Grade, LEAST_VIEWS, LensProjection, Solution, Status, VERIFIED};
 pub use settings::{Backend, Method, Proposal, SolveSettings};
 pub use stop::{StopReason, StopToken};
 pub use warning::{Warning, WarningCode};

@@ -15,6 +15,9 @@ use super::warning::{Warning, WarningCode};
 /// Observations from which on a track may be verified: two make a point, and one more verifies it.
 pub const VERIFIED: usize = 3;
 
+/// Views that a reconstruction needs: fewer carry no calibration, and nothing verifies their tracks.
+pub const LEAST_VIEWS: usize = 3;
+
 /// Whether a reconstruction stands.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "SCREAMING_SNAKE_CASE")]

@@ -21,9 +21,10 @@ pub enum WarningCode {
     UnobservableFocal,
     /// Another calibration explains the data about as well.
     SecondMinimum,
-    /// The metric model fits notably worse than the projective one (distortion, a zoom, a wrong principal point), or
-    /// focal lengths known beforehand contradict the tracks or each other.
+    /// The metric model fits notably worse than the projective one: distortion, a zoom, a wrong principal point.
     ModelMismatch,
+    /// Focal lengths known beforehand contradict the tracks or each other.
+    FocalPriorContradicted,
     /// Too few inlier tracks to verify or to calibrate.
     FewInliers,
     /// The data do not determine the principal point; it was taken to be near the image centre.
@@ -63,6 +64,7 @@ impl WarningCode {
             | WarningCode::UnobservableFocal
             | WarningCode::SecondMinimum
             | WarningCode::ModelMismatch
+            | WarningCode::FocalPriorContradicted
             | WarningCode::FewInliers
             | WarningCode::Cheirality
             | WarningCode::NoConsensus => true,
@@ -82,6 +84,11 @@ impl WarningCode {
         }
     }
 
+    /// Whether the tracks contradict the calibration, or what is known of it.
+    pub fn is_misfit(self) -> bool {
+        matches!(self, WarningCode::ModelMismatch | WarningCode::FocalPriorContradicted)
+    }
+
     /// The code as it stands in files.
     pub fn name(self) -> &'static str {
         match self {
@@ -95,6 +102,7 @@ impl WarningCode {
             WarningCode::SecondStructure => "SECOND_STRUCTURE",
             WarningCode::SecondMinimum => "SECOND_MINIMUM",
             WarningCode::ModelMismatch => "MODEL_MISMATCH",
+            WarningCode::FocalPriorContradicted => "FOCAL_PRIOR_CONTRADICTED",
             WarningCode::FewInliers => "FEW_INLIERS",
             WarningCode::Cheirality => "CHEIRALITY",
             WarningCode::NoConsensus => "NO_CONSENSUS",
@@ -123,14 +131,6 @@ pub struct Warning {
 impl Warning {
     pub fn new(code: WarningCode, detail: impl Into<String>) -> Self {
         Self { code, detail: detail.into(), camera_group: None }
-    }
-
-    /// Whether it says that a focal length known beforehand contradicts the tracks or another such.
-    ///
-    /// The code has other causes too, and results of earlier versions have nothing but the words.
-    pub fn doubts_focal_prior(&self) -> bool {
-        let words = [" px known beforehand", "the focal lengths that were given for views of one camera contradict"];
-        self.code == WarningCode::ModelMismatch && words.iter().any(|words| self.detail.contains(words))
     }
 
     /// The same of one camera group.

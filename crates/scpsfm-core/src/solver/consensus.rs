@@ -1,5 +1,6 @@
 //! A projective reconstruction of a block, and every track judged by it.
 
+pub use crate::domain::LEAST_VIEWS;
 use crate::domain::StopToken;
 use crate::geometry::bundle::Loss;
 use crate::geometry::measurement::CompleteBlock;
@@ -9,8 +10,6 @@ use crate::geometry::triangulation::batch::{Batch, LANES};
 use crate::geometry::{Camera, Point};
 
 const OPTIONS: ConsensusOptions = ConsensusOptions::DEFAULT;
-/// Views below which a projective reconstruction carries no calibration worth searching for.
-pub const LEAST_VIEWS: usize = 3;
 /// Tracks below which projective cameras of three views or more are not determined by image points:
 /// `2nk > 11n + 3k - 15`.
 pub const LEAST_SUPPORT: usize = 7;

@@ -56,7 +56,7 @@ impl KnownFocal {
         );
         // Near the quantile of a normal distribution at the same share of false warnings, whatever the views.
         let most = (contradicted.powi(2) + 2.0 * (self.views as f64).ln()).sqrt();
-        (self.deviations > most).then(|| Warning::new(WarningCode::ModelMismatch, detail))
+        (self.deviations > most).then(|| Warning::new(WarningCode::FocalPriorContradicted, detail))
     }
 }
 
@@ -90,7 +90,7 @@ mod tests {
         let torn = known(&[Some((1600.0, 0.01)), None, Some((800.0, 0.01)), Some((1600.0, 0.01))]).expect("a prior");
         assert!((torn.prior.sigma_log - 2f64.sqrt() / 3.0 * 2f64.ln()).abs() < 1e-3, "{torn:?}");
         let warning = torn.contradiction(3.0).expect("a warning");
-        assert_eq!(warning.code, WarningCode::ModelMismatch);
+        assert_eq!(warning.code, WarningCode::FocalPriorContradicted);
         let told = "that of view 2, 800.0 px, is 46.2 of its standard deviations from their mean; together they count \
                     as 1269.9 px +- 33 %";
         assert!(warning.detail.ends_with(told), "{warning:?}");

@@ -5,7 +5,7 @@ use std::collections::HashMap;
 use super::{FocalPrior, ImageSize, Input, RawInput, View};
 use crate::domain::error::{Violation, Violations, quoted};
 use crate::domain::limits::Limits;
-use crate::domain::result::VERIFIED;
+use crate::domain::result::LEAST_VIEWS;
 use crate::domain::words::counted;
 
 pub(super) fn check_counts(raw: &RawInput, limits: &Limits, field: &impl Fn(&str) -> String, found: &mut Violations) {
@@ -53,10 +53,11 @@ pub(super) fn check_counts(raw: &RawInput, limits: &Limits, field: &impl Fn(&str
     }
 }
 
-/// What is wrong with fewer than two views. Of two a solve says the same: only with the network do they have weights.
+/// What is wrong with fewer than two views. Two are taken: the network gives their tracks weights, and the result says
+/// that there is no reconstruction.
 pub fn too_few_views(count: usize) -> String {
     let given = if count == 1 { "1 view" } else { "no views" };
-    format!("{given} given; a reconstruction needs at least {VERIFIED}")
+    format!("{given} given; a reconstruction needs at least {LEAST_VIEWS}")
 }
 
 pub(super) fn check_views(views: &[View], field: &impl Fn(&str) -> String, found: &mut Violations) {
@@ -180,7 +181,7 @@ pub(super) fn check_views_with_observations(raw: &RawInput, field: &impl Fn(&str
     if count < 2 {
         found.push(Violation::of(
             field("view_indices"),
-            format!("all observations lie in one view; a reconstruction needs at least {VERIFIED}"),
+            format!("all observations lie in one view; a reconstruction needs at least {LEAST_VIEWS} views"),
         ));
     }
 }

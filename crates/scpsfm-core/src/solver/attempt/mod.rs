@@ -204,10 +204,9 @@ impl Attempt {
     /// one kind.
     pub fn is_trusted(&self) -> bool {
         self.calibration.as_ref().is_some_and(|calibration| {
-            let warns =
-                |codes: &[WarningCode]| calibration.warnings.iter().any(|warning| codes.contains(&warning.code));
-            let fits = calibration.grade != Grade::ProjectiveOnly && !warns(&[WarningCode::ModelMismatch]);
-            fits || self.is_good() || warns(&CRITICAL)
+            let warns = |is: &dyn Fn(WarningCode) -> bool| calibration.warnings.iter().any(|warning| is(warning.code));
+            let fits = calibration.grade != Grade::ProjectiveOnly && !warns(&WarningCode::is_misfit);
+            fits || self.is_good() || warns(&|code| CRITICAL.contains(&code))
         }) && !self.has_mixed_residuals()
     }
 

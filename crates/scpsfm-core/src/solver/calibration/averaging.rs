@@ -1,6 +1,7 @@
 //! What not knowing the model costs: standard deviations averaged over models.
 
 use super::models::{Candidate, Choice, Selection};
+use crate::domain::FocalPrior;
 use crate::geometry::bundle::metric::{Extension, IntrinsicsModel, IntrinsicsPrior, Optimum, Parameter};
 
 /// A model as the observations and what lenses are like weigh it.
@@ -18,6 +19,23 @@ pub(super) struct Sigmas {
     pub of_group: Vec<[Option<f64>; Parameter::COUNT]>,
     /// Of the log focal length of each view that has its own; `None`: unobservable.
     pub view_focals: Vec<Option<f64>>,
+}
+
+impl Sigmas {
+    /// The same where the observations say less by this factor, and what is known of focal lengths beforehand as much.
+    pub fn widened(mut self, factor: f64, focal_priors: &[Option<FocalPrior>]) -> Self {
+        for (of_group, prior) in self.of_group.iter_mut().zip(focal_priors) {
+            let of_prior = prior.map_or(0.0, |prior| prior.sigma_log.powi(-2));
+            let widened = |sigma: f64| {
+                let of_data = (sigma.powi(-2) - of_prior).max(0.0);
+                (of_prior + of_data / factor.powi(2)).powf(-0.5).max(sigma) / sigma
+            };
+            let factor = of_group[Parameter::LogFocal as usize].map_or(factor, widened);
+            of_group.iter_mut().flatten().for_each(|sigma| *sigma *= factor);
+        }
+        self.view_focals.iter_mut().flatten().for_each(|sigma| *sigma *= factor);
+        self
+    }
 }
 
 impl Choice<'_> {

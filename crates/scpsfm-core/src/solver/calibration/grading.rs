@@ -8,7 +8,7 @@ use super::search::Minimum;
 use super::verdict::Verdict;
 use super::view_focals::{self, Differing};
 use super::{Outcome, Stretch, Uncalibrated};
-use crate::domain::{FocalPrior, Grade, Warning, WarningCode};
+use crate::domain::{Grade, Warning, WarningCode};
 use crate::geometry::bundle::metric::{Extension, IntrinsicsModel, IntrinsicsPrior, Parameter};
 use crate::solver::error::Error;
 
@@ -36,8 +36,10 @@ pub(super) fn grade(
         }
     };
     let profile = choice.profile(best);
-    let comparison = Comparison { correlation: profile.correlation, ..comparison };
-    let sigmas = choice.sigmas(&selection, comparison.inflation() * profile.widening);
+    // Both are of the same residuals, seen from two sides.
+    let correlation = (profile.correlation / comparison.violation).max(1.0);
+    let sigmas = choice.sigmas(&selection, comparison.violation * profile.widening);
+    let sigmas = sigmas.widened(correlation, choice.problem.focal_priors);
     let has_own_focals = best.minimum.reconstruction.has_own_focals();
     let mut focals = view_focals::of(best, &sigmas, lenses);
     let determined: Vec<bool> = focals.iter().map(|view| view_focals::is_determined(view, grades)).collect();
@@ -62,9 +64,7 @@ pub(super) fn grade(
             false => {
                 let of_focal = sigmas.of_group[group][Parameter::LogFocal as usize];
                 let mut sigma = of_focal.filter(|sigma| *sigma < grades.unobservable_above);
-                if let Some(focal_prior) = choice.problem.focal_priors[group] {
-                    weigh_prior(&mut verdict, &mut sigma, choice, best, group, &comparison, focal_prior);
-                }
+                weigh_prior(&mut verdict, &mut sigma, choice, best, group, &comparison, correlation);
                 verdict.judge_sigma(sigma);
                 (of_focal, sigma)
             }
@@ -89,7 +89,7 @@ pub(super) fn grade(
         }
         verdict.judge_cheirality(best.minimum.cheirality);
         if verdict.grade != Grade::ProjectiveOnly && !has_own_focals {
-            verdict.warnings.extend(principal_point(best, group, comparison.inflation(), choice));
+            verdict.warnings.extend(principal_point(best, group, comparison.violation * correlation, choice));
         }
         let ratio = |sigma: Option<f64>| Some(sigma? / of_focal?).filter(|ratio| ratio.is_finite());
         Outcome {
@@ -204,6 +204,7 @@ fn of_data(best: &Candidate, group: usize, inflation: f64) -> Option<f64> {
 /// is wrong, and which is not known.
 ///
 /// * `comparison`: of the best with projective cameras
+/// * `correlation`: factor on the standard deviation of the observations alone beside that
 fn weigh_prior(
     verdict: &mut Verdict,
     sigma: &mut Option<f64>,
@@ -211,9 +212,10 @@ fn weigh_prior(
     best: &Candidate,
     group: usize,
     comparison: &Comparison,
-    focal_prior: FocalPrior,
+    correlation: f64,
 ) {
-    let of_data = of_data(best, group, comparison.inflation());
+    let Some(focal_prior) = choice.problem.focal_priors[group] else { return };
+    let of_data = of_data(best, group, comparison.violation * correlation);
     // It lifts the grade by one step at most.
     if of_data.is_none_or(|of_data| of_data > choice.problem.options.grades.weak_up_to) {
         verdict.grade = verdict.grade.worse(Grade::Weak);
@@ -236,14 +238,14 @@ fn weigh_prior(
     let focal_px = freed.minimum.reconstruction.intrinsics[group].focal * choice.scale_px;
     let Some(of_data) = freed.sigma(group, Parameter::LogFocal, freed.model, &freed.priors) else { return };
     // What is left of the misfit without the prior is not its doing.
-    let inflation = (comparison.inflation() * freed.fit.noise / best.fit.noise).max(1.0);
+    let inflation = (comparison.violation * freed.fit.noise / best.fit.noise).max(1.0) * correlation;
     if let Some(deviations) = contradicts((focal_px / focal_prior.focal_px).ln(), inflation * of_data) {
         let detail = format!(
             "the tracks alone give a focal length of {focal_px:.1} px, {deviations:.1} standard deviations from the \
              {:.1} px known beforehand",
             focal_prior.focal_px
         );
-        verdict.warnings.push(Warning::new(WarningCode::ModelMismatch, detail));
+        verdict.warnings.push(Warning::new(WarningCode::FocalPriorContradicted, detail));
         *sigma = sigma.map(|sigma| sigma * deviations);
     }
 }

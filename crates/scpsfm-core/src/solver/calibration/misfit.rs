@@ -6,8 +6,6 @@ use super::Uncalibrated;
 use super::fit::Fit;
 use super::models::{Candidate, Choice};
 use super::options::FitOptions;
-#[cfg(doc)]
-use super::profile::Profile;
 use crate::domain::StopToken;
 use crate::geometry::bundle::metric::{Extension, Intrinsics, IntrinsicsPrior, MetricReconstruction};
 use crate::geometry::bundle::sequence;
@@ -32,8 +30,6 @@ pub(super) struct Comparison {
     /// (20 scenes), the focal lengths were off by 2.2 % in the median and 17 % at most at a sigma of .45 %, with
     /// residuals 2 to 25 % larger than projective ones and this ratio between 2.6 and 10.5.
     pub violation: f64,
-    /// As [`Profile::correlation`].
-    pub correlation: f64,
 }
 
 impl Comparison {
@@ -45,11 +41,6 @@ impl Comparison {
     /// Whether the data violate the calibration by so much that it is said.
     pub fn is_violated(&self, options: &FitOptions) -> bool {
         self.violation > options.violation_limit
-    }
-
-    /// Factor on the standard deviations of the calibration: the two are of the same residuals, seen from two sides.
-    pub fn inflation(&self) -> f64 {
-        self.violation.max(self.correlation)
     }
 
     /// The same where all views fit worse than a stretch of them: their noise is taken to be that of the stretch.
@@ -75,7 +66,6 @@ impl Comparison {
             noise: fit.noise,
             is_significant: fit.loss_deviations(best.fit.cost, best.fit.freedom) > options.misfit_deviations,
             violation: if projective.refutes(&metric, options) { root } else { 1.0 },
-            correlation: 1.0,
         }
     }
 }

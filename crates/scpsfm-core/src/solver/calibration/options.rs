@@ -199,8 +199,8 @@ options! {
         /// that of the second radial term where it has a first. Principal points and distortion are as often in order
         /// (rectified, rendered) as not.
         likely: f64 = 0.5,
-        /// The same of a third radial term and of tangential distortion. Few lenses need a third term, or are so far
-        /// off centre that it shows.
+        /// The same of a third radial term where there is a second, and of tangential distortion where there is a first.
+        /// Few lenses need a third term, or are so far off centre that it shows.
         unlikely: f64 = 0.2,
         /// The same of the aspect. Pixels are square in all but old video.
         rare: f64 = 0.05,
@@ -297,8 +297,6 @@ options! {
         /// Iterations there. Few-view scenes with hardly any turning and chains of 40 views converge within nine, to
         /// 1e-13 of the cost (a test).
         profile_iterations: usize = 15,
-        /// Standard deviations from which the squared influences of tracks are larger than chance has them.
-        correlation_deviations: f64 = GATE_QUANTILE,
     }
 }
 

@@ -113,7 +113,8 @@ fn add(
     Ok(stands)
 }
 
-/// Joins the views that are left by fewer points, see [`GrowthOptions::LAST`], and merges components that share enough.
+/// Joins the views that are left by fewer points, see [`GrowthOptions::LAST`], moves those that another component holds
+/// better, and merges components that share enough.
 ///
 /// # Errors
 /// [`Error::Stopped`].
@@ -123,12 +124,11 @@ pub fn join_rest(
     trials: &mut [Trial],
     recorder: &mut Recorder,
 ) -> Result<(), Error> {
-    let rest: Vec<usize> = (0..problem.views()).filter(|&view| model.poses[view].is_none()).collect();
     for component in model.components() {
         // Some were merged into others meanwhile.
         let mut grown = Some(component).filter(|component| !model.of_component(*component).is_empty());
         while let Some(component) = grown {
-            register::join_again(problem, model, component, &GrowthOptions::LAST, &rest, trials, recorder)?;
+            register::join_again(problem, model, component, &GrowthOptions::LAST, trials, recorder)?;
             grown = merging::merge(problem, model, component, recorder);
         }
     }

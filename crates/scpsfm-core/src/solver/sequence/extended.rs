@@ -112,7 +112,7 @@ impl Extended {
     /// Whether nothing says that projective cameras would fit better.
     pub fn fits(&self) -> bool {
         let mut warnings = self.calibrations.iter().flat_map(|outcome| &outcome.warnings);
-        warnings.all(|warning| warning.code != WarningCode::ModelMismatch)
+        warnings.all(|warning| !warning.code.is_misfit())
     }
 
     /// Whether there is anything that geometry verifies: views that points hold, and enough points.

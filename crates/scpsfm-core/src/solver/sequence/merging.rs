@@ -1,5 +1,7 @@
 //! Components that are merged by all tracks that they share, where no view sees enough of them to be joined by itself.
 
+use std::collections::{BTreeMap, BTreeSet};
+
 use rand::SeedableRng;
 use rand_chacha::ChaCha8Rng;
 
@@ -37,15 +39,28 @@ pub fn merge(problem: &Problem, model: &mut Model, component: u32, recorder: &mu
     if model.has_common_centre {
         return None;
     }
-    let (into, from, similarity) =
-        model.components().into_iter().filter(|&other| other != component).find_map(|other| {
-            let (into, from) = (other.min(component), other.max(component));
-            Some((into, from, similarity(problem, model, into, from)?))
-        })?;
+    let (into, from, similarity) = sharing(problem, model, component).into_iter().find_map(|other| {
+        let (into, from) = (other.min(component), other.max(component));
+        Some((into, from, similarity(problem, model, into, from)?))
+    })?;
     let views = model.of_component(from);
     model.merge(problem, from, into, &similarity);
     structure::triangulate_seen(problem, model, &views, recorder);
     Some(into)
+}
+
+/// The other components that share with this one the tracks that a merger takes, increasing.
+fn sharing(problem: &Problem, model: &Model, component: u32) -> Vec<u32> {
+    let mut shared: BTreeMap<u32, usize> = BTreeMap::new();
+    for track in 0..problem.tracks() {
+        let views = problem.of_track(track).map(|k| problem.view_of(k)).filter(|&view| model.poses[view].is_some());
+        let of_track: BTreeSet<u32> = views.map(|view| model.component_of[view]).collect();
+        if of_track.contains(&component) {
+            of_track.into_iter().for_each(|other| *shared.entry(other).or_default() += 1);
+        }
+    }
+    shared.retain(|other, tracks| *other != component && *tracks >= OPTIONS.least_tracks);
+    shared.into_keys().collect()
 }
 
 /// What takes the second component to the first, where their tracks bear it out.

@@ -162,7 +162,7 @@ impl QuickPass {
         };
         let best = best.filter(|best| metric.as_ref().is_none_or(|metric| may_replace(best, metric)));
         Ok(match (best.map(|best| metric_of(problem, best, recorder)).transpose()?, metric) {
-            (Some(found), Some(metric)) if found.worth(problem) <= metric.worth(problem) => metric,
+            (Some(found), Some(metric)) if !found.outranks(&metric, problem) => metric,
             (None, Some(metric)) => metric,
             (found, _) => found.unwrap_or(Ended::Block(None)),
         })
@@ -255,11 +255,19 @@ impl Ended {
         }
     }
 
-    /// What decides between reconstructions that were found in different ways, see [`worth`]: of a calibration, whether
-    /// it fits as well as projective cameras.
+    /// Whether it is better than another one that was found in a different way: of two with a calibration, one that fits
+    /// as well as projective cameras, then one with more evidence; else one that is worth more.
+    fn outranks(&self, other: &Self, problem: &Problem) -> bool {
+        let [own, others] = [self, other].map(|ended| ended.calibrated_extension(problem));
+        match own.zip(others) {
+            Some((own, other)) => (own.fits(), self.evidence(problem)) > (other.fits(), other.evidence(problem)),
+            None => self.worth(problem) > other.worth(problem),
+        }
+    }
+
+    /// As [`worth`].
     fn worth(&self, problem: &Problem) -> f64 {
-        let fits = self.calibrated_extension(problem).is_some_and(Extended::fits);
-        worth(self.evidence(problem), fits)
+        worth(self.evidence(problem), self.calibrated_extension(problem).is_some())
     }
 
     /// What it began from.
@@ -450,10 +458,11 @@ fn by_projective_extension(
     Ok(best.or(unsolved))
 }
 
-/// What a reconstruction is worth: its evidence, and with a calibration [`ExtensionOptions::worth_of_calibration`] times
-/// that.
+/// What a reconstruction is worth: its evidence, not below 0, and with a calibration
+/// [`ExtensionOptions::worth_of_calibration`] times that.
 fn worth(evidence: f64, is_calibrated: bool) -> f64 {
-    if is_calibrated { ExtensionOptions::DEFAULT.worth_of_calibration * evidence } else { evidence }
+    let factor = if is_calibrated { ExtensionOptions::DEFAULT.worth_of_calibration } else { 1.0 };
+    factor * evidence.max(0.0)
 }
 
 /// Whether an attempt is verified by depths, and worth more than another that is not, see [`Attempt::outweighs`].

@@ -174,7 +174,7 @@ impl Model {
     /// had that yet.
     pub fn set_intrinsics(&mut self, problem: &Problem, view: usize, intrinsics: Intrinsics) {
         if let Some(own) = self.own_focals.get_mut(view) {
-            own.focal = intrinsics.focal;
+            *own = OwnFocal { focal: intrinsics.focal, is_determined: true };
         }
         let lens = &mut self.lenses[problem.camera_of[view]];
         if self.own_focals.is_empty() || !lens.is_known {

@@ -28,7 +28,7 @@ struct Component<'a> {
     rng: ChaCha8Rng,
 }
 
-/// Joins to a component every view that can be.
+/// Joins to a component every view that can be, as [`join_again`], and adjusts it first.
 ///
 /// # Errors
 /// [`Error::Stopped`].
@@ -39,16 +39,12 @@ pub fn join(
     trials: &mut [Trial],
     recorder: &mut Recorder,
 ) -> Result<(), Error> {
-    // Views that another component could not take may fit this one.
-    trials.iter_mut().for_each(|trial| trial.count = 0);
-    let mut growth = Component::new(problem, model, component, &OPTIONS);
-    growth.settle(recorder);
-    growth::grow(problem, &mut growth, &OPTIONS, trials, recorder)
+    Component::new(problem, model, component, &OPTIONS).settle(recorder);
+    join_again(problem, model, component, &OPTIONS, trials, recorder)
 }
 
-/// Tries these views again, as [`join`] does: what stands now may place them better.
-///
-/// * `views`: their trials count anew
+/// Joins to a component every view without a pose, or of another component, that can be. Their trials count anew: views
+/// that another component could not take may fit this one, and what stands now may place them better.
 ///
 /// # Errors
 /// [`Error::Stopped`].
@@ -57,11 +53,14 @@ pub fn join_again(
     model: &mut Model,
     component: u32,
     options: &GrowthOptions,
-    views: &[usize],
     trials: &mut [Trial],
     recorder: &mut Recorder,
 ) -> Result<(), Error> {
-    views.iter().for_each(|&view| trials[view].count = 0);
+    for (view, trial) in trials.iter_mut().enumerate() {
+        if model.poses[view].is_none() || model.component_of[view] != component {
+            trial.count = 0;
+        }
+    }
     growth::grow(problem, &mut Component::new(problem, model, component, options), options, trials, recorder)
 }
 
@@ -87,12 +86,16 @@ impl Growth for Component<'_> {
         self.model.of_component(self.component).len()
     }
 
-    /// Views of other components are open, too, that may be held by more points of this one: a component that began
-    /// with a wrong block would keep them from the right one.
+    /// A view of another component may move here if it sees more of this component's points than hold it there,
+    /// [`GrowthOptions::moving_ratio`] times as many: a component that began with a wrong block would keep its views from
+    /// the right one.
     fn is_open(&self, view: usize) -> bool {
-        let Self { problem, model, component, .. } = self;
-        let is_other = || model.component_of[view] != *component;
-        model.poses[view].is_none() || is_other() && model.held_by(problem, view) < model.supported[view]
+        let Self { problem, model, component, options, .. } = self;
+        let Some(_) = model.poses[view] else { return true };
+        let seen = model.supported[view];
+        model.component_of[view] != *component
+            && seen >= options.least_agreeing
+            && seen > options.moving_ratio * model.held_by(problem, view)
     }
 
     fn support(&self, view: usize) -> usize {
@@ -119,7 +122,8 @@ impl Growth for Component<'_> {
         let Some((intrinsics, (pose, agreeing))) = found else { return 0 };
         let is_enough =
             agreeing >= options.least_agreeing && agreeing as f64 >= options.least_share * seen.len() as f64;
-        if !is_enough || model.poses[view].is_some() && agreeing <= model.held_by(problem, view) {
+        let is_held = model.poses[view].is_some();
+        if !is_enough || (is_held && agreeing <= options.moving_ratio * model.held_by(problem, view)) {
             return agreeing;
         }
         model.set_intrinsics(problem, view, intrinsics);
@@ -167,7 +171,8 @@ fn guesses(problem: &Problem, model: &Model, view: usize) -> Vec<Intrinsics> {
         let focal = prior.focal_px / problem.scale_px;
         return [0.0, -1.0, 1.0].map(|by| behind_undone(focal * (by * prior.sigma_log).exp())).to_vec();
     }
-    let nearest = model.determined().into_iter().min_by_key(|other| other.abs_diff(view));
+    let others = model.determined().into_iter().filter(|other| *other != view);
+    let nearest = others.min_by_key(|other| other.abs_diff(view));
     let nearest = nearest.filter(|_| problem.has_own_focals());
     let about = nearest.map_or(lens.intrinsics, |nearest| model.intrinsics_of(problem, nearest));
     let focal = |step: i32| about.focal * (f64::from(step) / EXTENSION.focals_per_octave).exp2();

@@ -156,7 +156,7 @@ fn focal_priors_that_contradict_each_other_are_told_with_the_camera_group() {
     let input = Input::new(raw, &Limits::default(), "priors").expect("valid");
     let solution = solved(&input, &SolveSettings::default());
     let told = solution.warnings.iter().find(|warning| warning.detail.contains("that of view 4")).expect("a warning");
-    assert_eq!((told.code, told.camera_group), (WarningCode::ModelMismatch, Some(0)), "{told:?}");
+    assert_eq!((told.code, told.camera_group), (WarningCode::FocalPriorContradicted, Some(0)), "{told:?}");
     assert!(focal_error(&solution, &scene) < 0.1, "{:?}", solution.calibrations);
 }
 

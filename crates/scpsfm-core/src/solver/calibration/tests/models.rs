@@ -180,7 +180,7 @@ fn a_prior_helps_where_the_motion_says_little_and_is_contradicted_where_it_says_
         let off = strong.intrinsics.focal * SIDE_PX * 1.3;
         let outcome = calibrated_knowing(&strong, seed, 0.001, Some(FocalPrior { focal_px: off, sigma_log: 0.02 }));
         println!("seed {seed}: {:?} {:?} {:?}", outcome.grade, outcome.sigma_log_focal, outcome.warnings);
-        assert!(codes(&outcome).contains(&"MODEL_MISMATCH"), "seed {seed}: {:?}", outcome.warnings);
+        assert!(codes(&outcome).contains(&"FOCAL_PRIOR_CONTRADICTED"), "seed {seed}: {:?}", outcome.warnings);
         assert!(focal_error(&outcome, &strong) < 3.0 * outcome.sigma_log_focal.expect("observable"), "seed {seed}");
     }
 }
