@@ -66,6 +66,7 @@ pub(super) fn grade(
                 let mut sigma = of_focal.filter(|sigma| *sigma < grades.unobservable_above);
                 weigh_prior(&mut verdict, &mut sigma, choice, best, group, &comparison, correlation);
                 verdict.judge_sigma(sigma);
+                verdict.explain_sigma(correlation);
                 (of_focal, sigma)
             }
         };

@@ -39,6 +39,15 @@ impl<'a> Verdict<'a> {
         self.warnings.push(self.options.grades.unobservable(sigma));
     }
 
+    /// Says with an unobservable focal length by how much noise that observations of a track have in common widens sigma.
+    pub fn explain_sigma(&mut self, correlation: f64) {
+        let unobservable = self.warnings.iter_mut().find(|warning| warning.code == WarningCode::UnobservableFocal);
+        if let Some(warning) = unobservable.filter(|_| correlation > 1.0) {
+            let words = "noise that the observations of a track have in common makes it";
+            warning.detail.push_str(&format!("; {words} {correlation:.1} times as large"));
+        }
+    }
+
     /// Asks whether the metric reconstruction fits as well as the projective one.
     ///
     /// * `free`: what the metric one leaves free, in words
