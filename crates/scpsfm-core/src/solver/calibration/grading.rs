@@ -65,8 +65,7 @@ pub(super) fn grade(
                 let of_focal = sigmas.of_group[group][Parameter::LogFocal as usize];
                 let mut sigma = of_focal.filter(|sigma| *sigma < grades.unobservable_above);
                 weigh_prior(&mut verdict, &mut sigma, choice, best, group, &comparison, correlation);
-                verdict.judge_sigma(sigma);
-                verdict.explain_sigma(correlation);
+                verdict.judge_sigma(sigma, correlation);
                 (of_focal, sigma)
             }
         };

@@ -30,22 +30,20 @@ impl<'a> Verdict<'a> {
     }
 
     /// Grades by the standard deviation of the log focal length; `None`: unobservable.
-    pub fn judge_sigma(&mut self, sigma: Option<f64>) {
+    ///
+    /// * `correlation`: factor on it, for noise that the observations of a track have in common
+    pub fn judge_sigma(&mut self, sigma: Option<f64>, correlation: f64) {
         let grade = self.options.grades.grade(sigma);
         self.grade = self.grade.worse(grade);
         if grade != Grade::ProjectiveOnly || self.has(WarningCode::UnobservableFocal) {
             return;
         }
-        self.warnings.push(self.options.grades.unobservable(sigma));
-    }
-
-    /// Says with an unobservable focal length by how much noise that observations of a track have in common widens sigma.
-    pub fn explain_sigma(&mut self, correlation: f64) {
-        let unobservable = self.warnings.iter_mut().find(|warning| warning.code == WarningCode::UnobservableFocal);
-        if let Some(warning) = unobservable.filter(|_| correlation > 1.0) {
+        let mut warning = self.options.grades.unobservable(sigma);
+        if sigma.is_some() && correlation > 1.0 {
             let words = "noise that the observations of a track have in common makes it";
             warning.detail.push_str(&format!("; {words} {correlation:.1} times as large"));
         }
+        self.warnings.push(warning);
     }
 
     /// Asks whether the metric reconstruction fits as well as the projective one.

@@ -43,7 +43,7 @@ pub(super) fn judge(verdict: &mut Verdict, focals: &[ViewFocal]) -> Option<f64> 
     if (determined.len() as f64) < options.least_determined * focals.len() as f64 || sigma.is_none() {
         let is_bounded = |sigma: &f64| *sigma > options.weak_up_to && *sigma < options.unobservable_above;
         let typical = Some(median(&mut all)).filter(is_bounded);
-        verdict.judge_sigma(typical);
+        verdict.judge_sigma(typical, 1.0);
         return typical;
     }
     if determined.len() < focals.len() {
@@ -57,7 +57,7 @@ pub(super) fn judge(verdict: &mut Verdict, focals: &[ViewFocal]) -> Option<f64> 
             ),
         );
     }
-    verdict.judge_sigma(sigma);
+    verdict.judge_sigma(sigma, 1.0);
     sigma
 }
 
