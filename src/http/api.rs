@@ -43,14 +43,9 @@ const OPENAPI_PATH: &str = "/openapi.json";
 const JSON_COPIES: u64 = 60;
 
 /// Bytes that an object of JSON takes in memory at most, however short it is: `{},` of an array becomes a value and a
-/// tree of fields as it is read, and the largest message that a request repeats, in an array that has grown to twice
-/// its length, once the call has decoded it. Counting the objects as the body comes is simpler than to stop two
-/// decoders at every limit, and charges the bodies of real inputs, which are numbers, next to nothing.
+/// tree of fields as it is read. Counting the objects as the body comes is simpler than to stop a decoder at every
+/// limit, and charges the bodies of real inputs, which are numbers, next to nothing.
 const OBJECT_BYTES: u64 = 2 * size_of::<proto::CreateJobRequest>() as u64;
-
-/// Bytes that a byte of JSON takes at most in the message that a call decodes, beside [`OBJECT_BYTES`]: a label of
-/// eight bytes, `"a":"",`, has its place in a tree that is half full.
-const DECODED_COPIES: u64 = 16;
 
 /// How long a body may not move: as long as a `Solve`.
 const BODY_PATIENCE: Duration = Duration::from_secs(60);
@@ -188,7 +183,7 @@ impl Api {
         let permit = self.gateway.permit();
         let descriptor = route.method.input();
         let query = head.uri.query().unwrap_or_default();
-        let (mut message, length, decoded_bytes) = if route.has_body {
+        let (mut message, length) = if route.has_body {
             if let Some((name, _)) = form_urlencoded::parse(query.as_bytes()).next() {
                 return Err(invalid(&name, "is in the query; this call takes everything in its body"));
             }
@@ -202,7 +197,7 @@ impl Api {
                 };
                 set.map_err(|text| invalid(&name, text))?;
             }
-            (message, 0, 0)
+            (message, 0)
         };
         let (last_id, after) = LAST_EVENT_ID;
         if let Some(last_id) = head.headers.get(last_id).and_then(|id| id.to_str().ok())
@@ -230,8 +225,8 @@ impl Api {
         }
         let encode = move || Ok(Bytes::from(message.encode_to_vec()));
         let encoded = in_background(length, encode).await.map_err(failed)?;
-        // From here on it is the call's message. Its bytes are charged as they are read; what it takes decoded is not.
-        permit.hold(decoded_bytes).map_err(failed)?;
+        // From here on it is the call's message, which is charged as it is read and decoded.
+        permit.hold(encoded.len() as u64).map_err(failed)?;
         let call = call(&head.headers, connection_info, permit.clone(), encoded);
         let mut grpc = Grpc::new(self.gateway.service.clone()).max_decoding_message_size(usize::MAX);
         // Never fails: the services are always ready.
@@ -264,18 +259,18 @@ impl Api {
             || self.options.hosts.iter().any(|known| known.eq_ignore_ascii_case(&name))
     }
 
-    /// The message of a body, the length of the body, and what a call takes at most that decodes the message.
+    /// The message of a body, and the length of the body.
     pub(super) async fn read(
         &self,
         headers: &HeaderMap,
         body: Body,
         descriptor: MessageDescriptor,
         permit: &Permit,
-    ) -> Result<(DynamicMessage, usize, u64), Box<Answer>> {
-        let (text, objects) = self.collect(body, permit).await?;
+    ) -> Result<(DynamicMessage, usize), Box<Answer>> {
+        let text = self.collect(body, permit).await?;
         let length = text.len();
         if text.is_empty() {
-            return Ok((DynamicMessage::new(descriptor), 0, 0));
+            return Ok((DynamicMessage::new(descriptor), 0));
         }
         let kind = media_type(headers);
         if kind != "application/json" {
@@ -292,11 +287,11 @@ impl Api {
         };
         let message = in_background(length, parse).await.map_err(failed)?;
         let message = message.map_err(|description| invalid("body", description))?;
-        Ok((message, length, DECODED_COPIES * length as u64 + OBJECT_BYTES * objects))
+        Ok((message, length))
     }
 
-    /// The bytes of a body, charged as the JSON that they are, and its objects; more where strings hold a `{`.
-    async fn collect(&self, body: Body, permit: &Permit) -> Result<(Vec<u8>, u64), Box<Answer>> {
+    /// The bytes of a body, charged as the JSON that they are; more where strings hold a `{`.
+    async fn collect(&self, body: Body, permit: &Permit) -> Result<Vec<u8>, Box<Answer>> {
         let (mut text, mut objects) = (Vec::new(), 0);
         let mut frames = body.into_data_stream();
         while let Some(frame) = next_frame(&mut frames).await? {
@@ -320,7 +315,7 @@ impl Api {
             permit.hold(bytes).map_err(failed)?;
             text.extend_from_slice(&frame);
         }
-        Ok((text, objects))
+        Ok(text)
     }
 }
 
@@ -409,6 +404,5 @@ mod tests {
         // A leaf of a BTreeMap has 11 entries, here of a number and a value with its kind, and 16 bytes beside them.
         let leaf = 11 * (8 + 8 + value) + 16;
         assert!(OBJECT_BYTES + JSON_COPIES * 3 >= 2 * value + leaf, "an object with a field, in such an array");
-        assert!(size_of::<proto::View>() <= size_of::<proto::CreateJobRequest>());
     }
 }

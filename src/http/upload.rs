@@ -55,7 +55,7 @@ pub async fn answer(
     let (size_bytes, body) = if media_type(&head.headers) == PROTOBUF {
         (declared_length(&head.headers)?, body)
     } else {
-        let (message, length, _) = api.read(&head.headers, body, api.input_data.clone(), &permit).await?;
+        let (message, length) = api.read(&head.headers, body, api.input_data.clone(), &permit).await?;
         let encoded = in_background(length, move || Ok(message.encode_to_vec())).await.map_err(failed)?;
         permit.hold(encoded.len() as u64).map_err(failed)?;
         (encoded.len() as u64, Body::from(encoded))

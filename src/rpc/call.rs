@@ -14,9 +14,10 @@ use tonic::body::Body;
 use tonic::codegen::http::{HeaderMap, Request, Response};
 use tower::{Layer, Service};
 
-use super::access_log::{CallRecord, OpenCall, RefusalLog};
+use super::access_log::{OpenCall, RefusalLog};
 use super::auth::{Authenticate, CallKey, Lost};
 use super::inflight::{Budget, Permit};
+use super::message_body::MessageBody;
 use super::status;
 
 /// The layer around the services.
@@ -24,6 +25,8 @@ use super::status;
 pub struct CallLayer {
     pub authenticate: Authenticate,
     pub budget: Arc<Budget>,
+    /// Largest message, compressed and decompressed.
+    pub max_message_bytes: usize,
     pub refusals: RefusalLog,
 }
 
@@ -56,7 +59,7 @@ where
     }
 
     fn call(&mut self, mut request: Request<Body>) -> Self::Future {
-        let CallLayer { authenticate, budget, refusals } = &self.layer;
+        let CallLayer { authenticate, budget, max_message_bytes, refusals } = &self.layer;
         let call = OpenCall::begin(&request, refusals.clone());
         let record = call.record.clone();
         // A port that reads requests in another form has charged them already.
@@ -70,8 +73,9 @@ where
                 return Box::pin(async { Ok(refusal) });
             }
         };
-        let (lost, lost_later, charged) = (key.lost(), key.lost(), permit.clone());
-        let request = request.map(|body| RequestBody { body, lost: Some(key.lost()), permit: charged, record });
+        let (lost, lost_later) = (key.lost(), key.lost());
+        let request = MessageBody::in_place(request, *max_message_bytes, permit.clone(), record);
+        let request = request.map(|messages| RequestBody { messages, lost: Some(key.lost()) });
         let answer = self.inner.call(request.map(Body::new));
         Box::pin(async move {
             let answer = tokio::select! {
@@ -83,13 +87,11 @@ where
     }
 }
 
-/// The frames of a request, as long as its key stands and the budget holds them.
+/// The messages of a request, as long as its key stands.
 struct RequestBody {
-    body: Body,
+    messages: MessageBody,
     /// `None`: it was lost, and nothing follows.
     lost: Option<Lost>,
-    permit: Permit,
-    record: Arc<CallRecord>,
 }
 
 impl HttpBody for RequestBody {
@@ -102,21 +104,11 @@ impl HttpBody for RequestBody {
             self.lost = None;
             return Poll::Ready(Some(Err(status::withdrawn_key())));
         }
-        let frame = ready!(Pin::new(&mut self.body).poll_frame(context));
-        if let Some(Ok(frame)) = &frame
-            && let Some(data) = frame.data_ref()
-        {
-            let bytes = data.len() as u64;
-            self.record.receive(bytes);
-            if let Err(refusal) = self.permit.receive(bytes) {
-                return Poll::Ready(Some(Err(refusal)));
-            }
-        }
-        Poll::Ready(frame)
+        Pin::new(&mut self.messages).poll_frame(context)
     }
 
     fn is_end_stream(&self) -> bool {
-        self.lost.is_none() || self.body.is_end_stream()
+        self.lost.is_none() || self.messages.is_end_stream()
     }
 }
 
@@ -215,7 +207,8 @@ mod tests {
     fn layer() -> CallLayer {
         let rates = Arc::new(Rates::new(rates::Options::default(), DefaultClock::default()));
         let authenticate = Authenticate::new(None, rates);
-        CallLayer { authenticate, budget: Budget::new(u64::MAX), refusals: RefusalLog::default() }
+        let (budget, refusals) = (Budget::new(u64::MAX), RefusalLog::default());
+        CallLayer { authenticate, budget, max_message_bytes: usize::MAX, refusals }
     }
 
     /// A body of given frames.

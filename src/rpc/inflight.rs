@@ -16,9 +16,6 @@ use crate::telemetry::metrics::{Refusal, inflight_bytes, inflight_capacity, refu
 /// while it is read: in the chunks of the store, whole, and in the transport's buffer.
 pub const WORKING_COPIES: u64 = 3;
 
-/// How often a message is in memory: decoded, and as it came, in a buffer that the transport keeps for the next one.
-const MESSAGE_COPIES: u64 = 2;
-
 /// The bytes that all calls of a server may hold together.
 #[derive(Debug)]
 pub struct Budget {
@@ -30,6 +27,11 @@ impl Budget {
     pub fn new(max_bytes: u64) -> Arc<Self> {
         inflight_capacity(max_bytes);
         Arc::new(Self { max_bytes, used_bytes: Mutex::new(0) })
+    }
+
+    #[cfg(test)]
+    pub fn used(&self) -> u64 {
+        *locked(&self.used_bytes)
     }
 
     /// Takes `after` bytes in place of `before`, both of one call, if they fit. Fewer always do.
@@ -65,9 +67,9 @@ struct Shared {
 /// The bytes of one call.
 #[derive(Debug, Clone, Copy, Default)]
 struct Charge {
-    /// Of the message that is on its way in.
+    /// Of the message that is on its way in: as it came, decompressed and decoded.
     message: u64,
-    /// Of the largest message so far.
+    /// Of the largest message so far: tonic keeps its buffer for the next one.
     largest_message: u64,
     /// Of everything else, as the call says.
     held: u64,
@@ -75,7 +77,7 @@ struct Charge {
 
 impl Charge {
     fn bytes(self) -> u64 {
-        MESSAGE_COPIES.saturating_mul(self.largest_message).saturating_add(self.held)
+        self.largest_message.saturating_add(self.held)
     }
 }
 
@@ -120,7 +122,10 @@ impl Permit {
         locked(&self.shared.charge).message = 0;
     }
 
-    /// More of a message came.
+    /// A message takes so many bytes more.
+    ///
+    /// # Errors
+    /// As [`Permit::hold`].
     pub fn receive(&self, bytes: u64) -> Result<(), Status> {
         self.change(|charge| {
             charge.message = charge.message.saturating_add(bytes);
@@ -183,27 +188,23 @@ mod tests {
 
     use super::*;
 
-    fn used(budget: &Budget) -> u64 {
-        *locked(&budget.used_bytes)
-    }
-
     #[test]
     fn what_does_not_fit_is_refused_and_everything_is_given_back() {
         let budget = Budget::new(100);
         let (first, second) = (Permit::new(Arc::clone(&budget)), Permit::new(Arc::clone(&budget)));
         first.hold(60).expect("fits");
-        second.receive(20).expect("fits, twice");
-        let status = second.receive(1).expect_err("102 bytes");
+        second.receive(40).expect("fits");
+        let status = second.receive(1).expect_err("101 bytes");
         assert_eq!(status.code(), tonic::Code::ResourceExhausted);
         assert_eq!(status.get_details_error_info().expect("an ErrorInfo").reason, "MEMORY");
         assert!(status.get_details_retry_info().is_some_and(|retry| retry.retry_delay.is_some()));
-        assert_eq!(used(&budget), 100, "nothing changed");
+        assert_eq!(budget.used(), 100, "nothing changed");
         first.hold(20).expect("less always fits");
         let clone = first.clone();
         drop(first);
-        assert_eq!(used(&budget), 60, "a clone holds it");
+        assert_eq!(budget.used(), 60, "a clone holds it");
         drop((clone, second));
-        assert_eq!(used(&budget), 0);
+        assert_eq!(budget.used(), 0);
     }
 
     #[test]
@@ -215,7 +216,7 @@ mod tests {
             permit.next_message();
             permit.hold_more(held).expect("fits");
         }
-        assert_eq!(used(&budget), 75);
+        assert_eq!(budget.used(), 55);
     }
 
     #[test]
@@ -226,8 +227,8 @@ mod tests {
         assert!(large.hold(1_000).is_err());
         drop(other);
         large.hold(1_000).expect("alone");
-        assert_eq!(used(&budget), 100);
+        assert_eq!(budget.used(), 100);
         large.hold(40).expect("less always fits");
-        assert_eq!(used(&budget), 40);
+        assert_eq!(budget.used(), 40);
     }
 }

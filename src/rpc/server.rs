@@ -189,6 +189,7 @@ impl Server {
         let calls = CallLayer {
             authenticate: Authenticate::new(keys, rates),
             budget: Budget::new(options.max_inflight_bytes),
+            max_message_bytes: options.max_message_bytes,
             refusals: RefusalLog::default(),
         };
         let listen_error = |source| Error::Listen { address: options.listen, source };

@@ -20,7 +20,7 @@
 //! | `RESOURCE_EXHAUSTED` | `UPLOADS_FULL` | the tenant has uploaded as much as it may, by the bound of `metadata["bound"]`: `tenant_uploads` or `tenant_upload_bytes`; `RetryInfo` |
 //! | `INVALID_ARGUMENT` | `UPLOAD_TOO_LARGE` | the upload alone is more than the bound of `metadata["bound"]` ever allows: `upload_bytes` or `tenant_upload_bytes`; `metadata` has `key`, `asked` and `max` too |
 //! | `INVALID_ARGUMENT` | `MALFORMED_MESSAGE` | a message that cannot be decoded |
-//! | `OUT_OF_RANGE` | `MESSAGE_TOO_LARGE` | a message above `Capabilities.input_limits.max_message_bytes`, packed or not |
+//! | `OUT_OF_RANGE` | `MESSAGE_TOO_LARGE` | a message above `Capabilities.input_limits.max_message_bytes`, compressed or not, or above eight times that once decoded |
 //! | `RESOURCE_EXHAUSTED` | `QUEUE_FULL` | admission refused, by the queue's bound of `metadata["bound"]`: `jobs`, `bytes`, `observations`, `tenant_jobs` or `tenant_bytes`; `RetryInfo` says when to come back |
 //! | `INVALID_ARGUMENT` | `BATCH_TOO_LARGE` | the batch alone is more than the queue's bound of `metadata["bound"]` ever allows, named as for `QUEUE_FULL`; `metadata` has `key`, `asked` and `max` too |
 //! | `INVALID_ARGUMENT` | `JOB_TOO_LARGE` | the solver would take more memory for the job than `engine.max_solver_bytes`; `metadata` as for `BATCH_TOO_LARGE` |

@@ -6,8 +6,9 @@ use prost::Message;
 use crate::domain::{InvalidInput, Limits, Violation};
 use crate::rpc::proto;
 
-/// Entries of an array in one chunk that a client sends: at most 2.8 MB, well below any server's message limit.
-pub const CHUNK_ENTRIES: usize = 65_536;
+/// Entries of an array in one chunk that a client sends: at most .7 MB, below the least message limit that a server may
+/// have (1 MiB).
+pub const CHUNK_ENTRIES: usize = 16_384;
 
 /// How often the bytes of a match are in memory while matches are joined: the match itself, its place in the order, and
 /// in the lists of neighbours and of pieces, some 52 bytes for the 8 of two keypoints.

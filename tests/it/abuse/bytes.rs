@@ -24,7 +24,7 @@ const MOST_MB: u64 = 300;
 
 /// Messages as the bytes that they are.
 #[derive(Debug, Clone, Copy, Default)]
-struct Raw;
+pub struct Raw;
 
 impl Codec for Raw {
     type Encode = Vec<u8>;

@@ -4,6 +4,7 @@ use std::process::Stdio;
 use std::sync::Arc;
 use std::time::Duration;
 
+use prost::Message as _;
 use scpsfm::rpc::convert;
 use scpsfm::rpc::convert::input_message::InputMessage;
 use scpsfm::rpc::proto::calibration_service_client::CalibrationServiceClient;
@@ -13,10 +14,14 @@ use scpsfm::rpc::server::Options;
 use tokio::sync::mpsc;
 use tokio_stream::StreamExt;
 use tokio_stream::wrappers::ReceiverStream;
+use tonic::client::Grpc;
+use tonic::codec::CompressionEncoding;
+use tonic::codegen::http::uri::PathAndQuery;
 use tonic::transport::Channel;
-use tonic::{Code, Status};
+use tonic::{Code, Request, Status};
 use tonic_types::StatusExt;
 
+use super::bytes::Raw;
 use crate::support::live::{connected, created, lasting, reaches, small};
 use crate::support::memory::peak_mb;
 use crate::support::program::Serving;
@@ -115,6 +120,44 @@ async fn inputs_that_never_end_hold_no_more_than_the_budget_and_harm_nobody() {
     created(&mut jobs, large()).await;
     let job = jobs.get_job(proto::GetJobRequest { name: running }).await.expect("a job").into_inner();
     assert!(job.attempt_count == 1 && matches!(job.state(), JobState::Running | JobState::Succeeded), "{job:?}");
+}
+
+/// Views of which nothing is known have two bytes each in a message, fewer where it is compressed, and 64 decoded.
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn messages_that_decode_to_many_times_their_bytes_are_refused_before_they_are_decoded() {
+    const CALLS: usize = 8;
+    let directory = tempfile::tempdir().expect("a temporary directory");
+    let budget = BUDGET.to_string();
+    let bounds =
+        [("SCPSFM_SERVER__MAX_INFLIGHT_BYTES", budget.as_str()), ("SCPSFM_SERVER__MAX_MESSAGE_BYTES", "10000000")];
+    let server = Serving::start_with(&directory.path().join("data"), &bounds, Stdio::null());
+    let views = vec![proto::View::default(); 4_000_000];
+    let message = create(Source::TrackSet(proto::TrackSet { views, ..proto::TrackSet::default() })).encode_to_vec();
+    for is_compressed in [false, true] {
+        let mut calls = Vec::new();
+        for _ in 0..CALLS {
+            let channel = Channel::from_shared(server.grpc.clone()).expect("a URL").connect().await;
+            let grpc = Grpc::new(channel.expect("a connection"));
+            let mut grpc = if is_compressed { grpc.send_compressed(CompressionEncoding::Gzip) } else { grpc };
+            let request = Request::new(message.clone());
+            calls.push(tokio::spawn(async move {
+                grpc.ready().await.expect("a connection");
+                let path = PathAndQuery::from_static("/scpsfm.v1.JobService/CreateJob");
+                grpc.unary(request, path, Raw).await.map(drop)
+            }));
+        }
+        let mut too_large = 0;
+        for call in calls {
+            let status = call.await.expect("no panic").expect_err("too large");
+            match reason(&status).as_str() {
+                "MESSAGE_TOO_LARGE" => too_large += 1,
+                _ => assert!(is_refusal(&status), "{status:?}"),
+            }
+        }
+        assert!(too_large > 0, "all were refused for what others hold");
+    }
+    let peak = peak_mb(server.running.0.id());
+    assert!(peak < (BUDGET >> 20) + 200, "{peak} MB");
 }
 
 #[tokio::test]
