@@ -216,8 +216,11 @@ fn weigh_prior(
 ) {
     let Some(focal_prior) = choice.problem.focal_priors[group] else { return };
     let of_data = of_data(best, group, comparison.violation * correlation);
+    // What the observations add to it, with all doubt about the model.
+    let added = sigma.map_or(0.0, |sigma| sigma.powi(-2)) - focal_prior.sigma_log.powi(-2);
+    let is_observable = |sigma: f64| sigma <= choice.problem.options.grades.weak_up_to;
     // It lifts the grade by one step at most.
-    if of_data.is_none_or(|of_data| of_data > choice.problem.options.grades.weak_up_to) {
+    if !of_data.is_some_and(is_observable) || !is_observable(added.max(0.0).powf(-0.5)) {
         verdict.grade = verdict.grade.worse(Grade::Weak);
     }
     let alone = without_focal(best, group);
