@@ -1,6 +1,6 @@
 //! Cameras and points up to a common projective transform.
 
-use nalgebra::{Matrix4, Vector4};
+use nalgebra::{Matrix2, Matrix4, Vector2, Vector4};
 
 use super::block::Block;
 use super::consensus::{self, Consensus};
@@ -64,6 +64,22 @@ impl ProjectiveReconstruction {
 
     fn unknowns(&self) -> usize {
         projective::unknowns(self.views.len(), self.tracks.len())
+    }
+
+    /// Coordinates that the views measure independently: two each, one where the points of a view lie on a line.
+    ///
+    /// * `least_across`: spread across that line from which they do not, in units of the noise
+    pub fn coordinates(&self, least_across: f64) -> usize {
+        let mut of_view = vec![Vec::new(); self.views.len()];
+        self.observations.iter().for_each(|seen| of_view[seen.view].push(seen.xy));
+        let measured = |points: &Vec<Vector2<f64>>| {
+            let count = points.len().max(1) as f64;
+            let mean = points.iter().sum::<Vector2<f64>>() / count;
+            let spread: Matrix2<f64> = points.iter().map(|xy| (xy - mean) * (xy - mean).transpose()).sum();
+            let across = (spread / count).symmetric_eigenvalues().min().max(0.0).sqrt();
+            if across < least_across * self.noise { 1 } else { 2 }
+        };
+        of_view.iter().map(measured).sum()
     }
 
     /// The tracks with most observations, evenly among equals: a calibration takes no more than these.

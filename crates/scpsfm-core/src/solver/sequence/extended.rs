@@ -122,12 +122,11 @@ impl Extended {
             && self.calibrations.iter().any(|outcome| outcome.metric.is_some())
     }
 
-    /// Whether nothing is to be gained by extending without a calibration: most views hold together so precisely that
-    /// wrong observations do not, and fit as well as projective cameras or are METRIC.
+    /// Whether nothing is to be gained by extending without a calibration: it has one, or most views hold together so
+    /// precisely that wrong observations do not, and fit as well as projective cameras.
     pub fn is_settled(&self, problem: &Problem) -> bool {
         let is_precise = self.model.noise <= NoiseOptions::DEFAULT.initial;
-        // Windows that differ a little warn of a mismatch of a METRIC one too.
-        is_precise && self.holds_most_views() && (self.fits() || self.grade(problem) == Grade::Metric)
+        self.is_calibrated(problem) || is_precise && self.holds_most_views() && self.fits()
     }
 
     pub fn holds_most_views(&self) -> bool {

@@ -8,7 +8,10 @@
 
 use std::f64::consts::SQRT_2;
 
-use super::{Ended, Extended, QUICK_SEED, QuickPass};
+use super::ended::Ended;
+use super::extended::Extended;
+use super::quick_pass::QuickPass;
+use super::starts::QUICK_SEED;
 use crate::domain::Grade;
 use crate::geometry::bundle::metric::Intrinsics;
 use crate::geometry::homography;
@@ -50,10 +53,11 @@ const OPTIONS: LensSearchOptions = LensSearchOptions::DEFAULT;
 /// Unknowns of the homography between two views.
 const HOMOGRAPHY_UNKNOWNS: usize = 8;
 
-/// Whether an answer behind lenses explains nearly as much as the one without: a calibration of a part is not to
-/// replace a reconstruction of the whole.
-pub fn explains_enough(evidence: f64, of_pinholes: f64) -> bool {
-    evidence > OPTIONS.least_kept * of_pinholes
+/// Whether an answer behind lenses replaces one without: it has a calibration, and explains nearly as much. That of a
+/// part is not to replace a reconstruction of the whole.
+fn replaces(behind: &Ended, of_pinholes: &Ended, problem: &Problem) -> bool {
+    behind.calibrated_extension(problem).is_some()
+        && behind.evidence(problem) > OPTIONS.least_kept * of_pinholes.evidence(problem)
 }
 
 /// What came of an input behind lenses.
@@ -63,6 +67,11 @@ pub struct BehindLenses {
 }
 
 impl BehindLenses {
+    /// As [`replaces`].
+    pub fn replaces(&self, of_pinholes: &Ended, problem: &Problem) -> bool {
+        replaces(&self.ended, of_pinholes, problem)
+    }
+
     /// The answer, its lenses undone in the problem.
     pub fn accept(self, problem: &mut Problem) -> Ended {
         problem.undone = self.undone;
@@ -84,7 +93,7 @@ pub fn solve_behind(
         return Ok(None);
     }
     let mut ended = QuickPass::new(problem, recorder)?.finish(problem, recorder)?;
-    let calibrated = ended.calibrated_extension(problem).filter(|_| !ended.replaces(of_pinholes, problem));
+    let calibrated = ended.calibrated_extension(problem).filter(|_| !replaces(&ended, of_pinholes, problem));
     if calibrated.is_some_and(|extended| undo_calibrated(problem, extended)) {
         ended = QuickPass::new(problem, recorder)?.finish(problem, recorder)?;
     }

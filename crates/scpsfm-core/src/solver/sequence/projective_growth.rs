@@ -219,8 +219,8 @@ impl<'a> Growing<'a> {
         let norms: Vec<f64> = reconstruction.squared_residuals().into_iter().map(f64::sqrt).collect();
         let unknowns = bundle::projective::unknowns(reconstruction.views.len(), reconstruction.tracks.len());
         let noise = core_noise(norms, unknowns)?;
-        let (least, most) = NoiseOptions::DEFAULT.bounds;
-        Some(noise.clamp(least, (self.options.noise_growth * self.start_noise).min(most)))
+        let options = NoiseOptions::DEFAULT;
+        Some(noise.clamp(options.bounds.0, options.clamp(self.options.noise_growth * self.start_noise)))
     }
 
     /// Takes back the views that too few points hold, and returns them.

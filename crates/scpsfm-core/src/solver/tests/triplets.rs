@@ -2,11 +2,12 @@
 
 use std::collections::BTreeMap;
 
-use rand::SeedableRng;
 use rand::seq::index;
+use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 
 use super::*;
+use crate::domain::ImageSize;
 use crate::solver::view_selection;
 
 const VIEWS: usize = 20;
@@ -77,5 +78,28 @@ fn pairs_of_views_without_structure_are_no_reconstruction() {
         assert_eq!(solution.status, Status::NoReconstruction, "seed {seed}: {:?}", solution.warnings);
         let reason = solution.warnings.iter().find(|warning| warning.code == WarningCode::FewInliers);
         assert!(reason.is_some_and(|reason| reason.detail.contains("more than by chance")), "{:?}", solution.warnings);
+    }
+}
+
+/// Where the points of three views lie on a line in each, every track agrees with some point.
+#[test]
+fn points_on_a_line_in_each_view_are_no_reconstruction() {
+    for (seed, (views, tracks)) in (0..).zip([(6, 40), (12, 80), (20, 50)]) {
+        let mut rng = ChaCha8Rng::seed_from_u64(seed);
+        for slopes in [[1.0; 20], std::array::from_fn(|view| 0.1 * view as f64)] {
+            let mut raw = RawInput { track_count: tracks, ..RawInput::default() };
+            let size = Some(ImageSize { width_px: 1000, height_px: 1000 });
+            raw.views = vec![View { size, ..View::default() }; views];
+            for (track, view) in (0..tracks).flat_map(|track| (0..views).map(move |view| (track, view))) {
+                let x: f64 = rng.random_range(0.0..1000.0);
+                raw.view.push(view as u32);
+                raw.track.push(track as u32);
+                raw.x.push(x);
+                raw.y.push(slopes[view] * x);
+            }
+            let input = Input::new(raw, &Limits::default(), "line").expect("valid input");
+            let solution = solved(&input, &SolveSettings::default());
+            assert_eq!(solution.grade, None, "{views} views of {tracks} tracks: {:?}", solution.warnings);
+        }
     }
 }

@@ -1,0 +1,118 @@
+//! In which order seeds are tried: what is cheap first.
+
+use std::ops::ControlFlow;
+
+use super::blocks::Blocks;
+use super::ended::{Ended, metric_of};
+use super::options::ExtensionOptions;
+use super::starts::{QUICK_SEED, Start, by_projective_extension, extend_projectively, stands, starts};
+use super::triplets::Pairs;
+use crate::solver::attempt::{self, Attempt};
+use crate::solver::block::Block;
+use crate::solver::error::Error;
+use crate::solver::problem::Problem;
+use crate::solver::projective::ProjectiveReconstruction;
+use crate::solver::recorder::Recorder;
+use crate::solver::view_selection::{SeedViews, ViewSelectionOptions};
+use crate::solver::{near_duplicates, view_selection};
+
+/// The blocks of an input, and what their first search, calibration and metric extension came to.
+pub struct QuickPass {
+    blocks: Blocks,
+    /// Breaks where nothing else needs to be tried.
+    result: ControlFlow<Ended, Ended>,
+}
+
+impl QuickPass {
+    pub fn new(problem: &Problem, recorder: &mut Recorder) -> Result<Self, Error> {
+        let blocks = Blocks::of(problem);
+        let result = blocks.by_calibration(problem, blocks.begin_quickly(problem), recorder)?;
+        Ok(Self { blocks, result })
+    }
+
+    pub fn result(&self) -> &Ended {
+        match &self.result {
+            ControlFlow::Break(ended) | ControlFlow::Continue(ended) => ended,
+        }
+    }
+
+    /// What else is tried where the quick pass has neither a calibration nor a precise reconstruction of most views.
+    ///
+    /// In order of cost: what it found and small subsets of the blocks, extended projectively and calibrated then; where
+    /// that is not METRIC and holds less than half of the views, triplets in the same way. Only where none of these
+    /// stands: the blocks again, with everything that a search can try, and the subsets that are left. An input whose
+    /// tracks are mostly complete is its only block; with depths it is searched at length at once.
+    ///
+    /// # Errors
+    /// [`Error::Stopped`]; [`Error::Internal`] for defects.
+    pub fn finish(self, problem: &Problem, recorder: &mut Recorder) -> Result<Ended, Error> {
+        let Self { blocks, result } = self;
+        let is_quick = blocks.begin_quickly(problem);
+        let first = match result {
+            ControlFlow::Break(ended) => return Ok(ended),
+            ControlFlow::Continue(ended) => ended.seed(),
+        };
+        let subsets = view_selection::subsets(&blocks.sets);
+        let first_subsets = if blocks.is_whole { ExtensionOptions::DEFAULT.first_subsets } else { subsets.len() };
+        let cheap = first_subsets.min(subsets.len());
+        let (cheap, rest) = subsets.split_at(cheap);
+        // Nothing else is searched of a whole input with depths: what it has found stands.
+        let mut best = by_projective_extension(problem, None, starts(first, !is_quick, cheap), recorder)?;
+        let leaves_most = |best: &Attempt| !best.is_good() && best.leaves_most_views(problem);
+        if !blocks.is_whole && best.as_ref().is_none_or(leaves_most) {
+            let triplets = view_selection::triplets(problem, &vec![true; problem.views()]);
+            let starts = triplets.into_iter().map(|views| Start::Views(SeedViews::Triplet(views))).collect();
+            best = by_projective_extension(problem, best, starts, recorder)?;
+        }
+        if is_quick && !stands(&best) {
+            let first = match blocks.by_calibration(problem, false, recorder)? {
+                ControlFlow::Break(ended) => return Ok(ended),
+                ControlFlow::Continue(ended) => ended.seed(),
+            };
+            best = by_projective_extension(problem, None, starts(first, false, rest), recorder)?;
+        }
+        best.map_or(Ok(Ended::Block(None)), |best| metric_of(problem, best, recorder))
+    }
+}
+
+/// The first projective reconstruction that a quick search leads to, without a calibration: of blocks, and where
+/// tracks are incomplete and blocks have fewer than they should, of triplets; `None` where nothing stands.
+///
+/// * `is_promising`: which blocks, without near-duplicates, are worth a search
+/// * `most_triplets`: how many triplets are searched
+///
+/// # Errors
+/// As [`QuickPass::finish`].
+pub fn reconstruct_quickly(
+    problem: &Problem,
+    is_promising: impl Fn(&Block) -> bool,
+    most_triplets: usize,
+    recorder: &mut Recorder,
+) -> Result<Option<ProjectiveReconstruction>, Error> {
+    let Blocks { sets, is_whole } = Blocks::of(problem);
+    let blocks: Vec<Block> =
+        sets.iter().map(|views| near_duplicates::without(&problem.representative, problem.block(views))).collect();
+    let are_sparse = blocks.iter().all(|block| block.tracks.len() < ViewSelectionOptions::DEFAULT.wanted_tracks);
+    for block in blocks.into_iter().filter(is_promising) {
+        problem.stopped()?;
+        let mut attempt = attempt::search_block(problem, block, QUICK_SEED, recorder)?;
+        extend_projectively(problem, &mut attempt, false, recorder)?;
+        if attempt.projective.is_some() {
+            return Ok(attempt.projective);
+        }
+    }
+    if is_whole || !are_sparse {
+        return Ok(None);
+    }
+    let mut pairs = Pairs::new(problem);
+    let triplets = view_selection::triplets(problem, &vec![true; problem.views()]);
+    for views in triplets.into_iter().take(most_triplets) {
+        problem.stopped()?;
+        let mut attempt = pairs.attempt(&views, recorder)?;
+        extend_projectively(problem, &mut attempt, false, recorder)?;
+        if attempt.projective.is_some() {
+            return Ok(attempt.projective);
+        }
+    }
+    Ok(None)
+}

@@ -1,0 +1,141 @@
+//! Seeds that are extended to all views without a calibration, and calibrated then.
+
+use super::options::{ExtensionOptions, GrowthOptions};
+use super::projective_growth;
+use super::triplets::Pairs;
+use crate::domain::Stage;
+use crate::solver::attempt::{self, Attempt, Effort};
+use crate::solver::consensus::{self, LEAST_INLIERS};
+use crate::solver::error::Error;
+use crate::solver::learned::TrackScoreOptions;
+use crate::solver::problem::Problem;
+use crate::solver::recorder::Recorder;
+use crate::solver::view_selection::SeedViews;
+
+/// How subsets are searched, of which many are tried.
+pub const QUICK_SEED: Effort = Effort { is_seed: true, is_quick: true };
+
+/// What a projective extension begins from.
+pub enum Start {
+    /// What was found already.
+    Found {
+        attempt: Box<Attempt>,
+        /// Whether it stands as it is where its extension leaves too little.
+        keeps: bool,
+    },
+    Views(SeedViews),
+}
+
+/// What was found already, then the blocks of these sets of views.
+pub fn starts(found: Option<Attempt>, keeps: bool, sets: &[Vec<usize>]) -> Vec<Start> {
+    let found = found.map(|attempt| Start::Found { attempt: Box::new(attempt), keeps });
+    found.into_iter().chain(sets.iter().map(|views| Start::Views(SeedViews::Block(views.clone())))).collect()
+}
+
+/// The best of one that stands and of these, each extended to all views without a calibration and, where it is not
+/// known yet, calibrated then; the first that is METRIC.
+pub fn by_projective_extension(
+    problem: &Problem,
+    best: Option<Attempt>,
+    starts: Vec<Start>,
+    recorder: &mut Recorder,
+) -> Result<Option<Attempt>, Error> {
+    let (mut best, mut unsolved) = if stands(&best) { (best, None) } else { (None, best) };
+    let mut pairs = Pairs::new(problem);
+    let count = starts.len();
+    for (k, start) in starts.into_iter().enumerate() {
+        problem.stopped()?;
+        let (mut attempt, keeps) = match start {
+            Start::Found { attempt, keeps } => (*attempt, keeps),
+            Start::Views(views) => {
+                recorder.begin_block(k, count);
+                let attempt = match views {
+                    SeedViews::Block(views) => {
+                        attempt::search_block(problem, problem.block(&views), QUICK_SEED, recorder)?
+                    }
+                    SeedViews::Triplet(views) => pairs.attempt(&views, recorder)?,
+                };
+                (attempt, false)
+            }
+        };
+        extend_projectively(problem, &mut attempt, keeps, recorder)?;
+        if attempt.projective.is_none() {
+            unsolved = unsolved.or(Some(attempt));
+            continue;
+        }
+        // The same one, reached from elsewhere, or a part of it: calibrating takes longer than all else.
+        let is_known = |best: &Attempt| {
+            let is_part = attempt.views().iter().all(|view| best.views().binary_search(view).is_ok());
+            let grown = attempt.evidence(problem) / best.evidence(problem);
+            is_part && grown < ExtensionOptions::DEFAULT.least_evidence_growth
+        };
+        if best.as_ref().is_some_and(|best| is_known(best) || outweighs(best, &attempt)) {
+            continue;
+        }
+        attempt::calibrate(problem, &mut attempt, &[], recorder)?;
+        let worth = |attempt: &Attempt| worth(attempt.evidence(problem), attempt.is_calibrated());
+        if best.as_ref().is_none_or(|best| outweighs(&attempt, best) || worth(&attempt) > worth(best)) {
+            best = Some(attempt);
+        }
+        if best.as_ref().is_some_and(Attempt::is_good) {
+            break;
+        }
+    }
+    Ok(best.or(unsolved))
+}
+
+/// What a reconstruction is worth: its evidence, not below 0, and with a calibration
+/// [`ExtensionOptions::worth_of_calibration`] times that.
+fn worth(evidence: f64, is_calibrated: bool) -> f64 {
+    let factor = if is_calibrated { ExtensionOptions::DEFAULT.worth_of_calibration } else { 1.0 };
+    factor * evidence.max(0.0)
+}
+
+/// Whether an attempt is verified by depths, and worth more than another that is not, see [`Attempt::outweighs`].
+fn outweighs(attempt: &Attempt, other: &Attempt) -> bool {
+    let of_other = other.projective.as_ref().filter(|_| !other.is_by_depths());
+    of_other.is_some_and(|other| attempt.outweighs(&other.views, other.noise))
+}
+
+/// Extends what an attempt has found to all views and tracks, as far as image points verify it by themselves.
+///
+/// * `keeps`: whether what was found stands where that leaves too little, else nothing does; what depths verify stands
+///   in any case, and where it outweighs the extension, see [`Attempt::outweighs`]
+pub fn extend_projectively(
+    problem: &Problem,
+    attempt: &mut Attempt,
+    keeps: bool,
+    recorder: &mut Recorder,
+) -> Result<(), Error> {
+    if attempt.is_beyond_image_points() {
+        return Ok(());
+    }
+    let Some(start) = attempt.projective.take() else { return Ok(()) };
+    recorder.enter(Stage::Extend);
+    let by_depths = !attempt.judges_observations();
+    // Of few tracks that depths have verified one more may agree by chance.
+    let least = if by_depths { TrackScoreOptions::DEFAULT.surely_enough } else { LEAST_INLIERS };
+    let before = (keeps || by_depths).then(|| start.clone());
+    let mut options = GrowthOptions::PROJECTIVE;
+    if keeps && start.views.len() < problem.observed_views().len() {
+        // The complete tracks of a whole input have their points: views that join give none and move none.
+        options = GrowthOptions { gives_points: false, adjust_growth: f64::INFINITY, final_rounds: 1, ..options };
+    }
+    let extended = projective_growth::extend(problem, start, &options, recorder)?;
+    let coordinates = extended.coordinates(ExtensionOptions::DEFAULT.least_across);
+    let is_enough = coordinates >= 2 * consensus::LEAST_VIEWS && extended.tracks.len() >= least;
+    attempt.projective = before;
+    if is_enough && !attempt.outweighs(&extended.views, extended.noise) {
+        attempt.projective = Some(extended);
+        attempt.verified_by_image_points();
+    } else if attempt.projective.is_none() {
+        // The reason is that of an attempt without a consensus.
+        attempt.found.consensus = None;
+    }
+    Ok(())
+}
+
+/// Whether there is a reconstruction.
+pub fn stands(attempt: &Option<Attempt>) -> bool {
+    attempt.as_ref().is_some_and(|attempt| attempt.projective.is_some())
+}
