@@ -62,7 +62,7 @@ where
         let CallLayer { authenticate, budget, max_message_bytes, refusals } = &self.layer;
         let call = OpenCall::begin(&request, refusals.clone());
         let record = call.record.clone();
-        // A port that reads requests in another form has charged them already.
+        // A port that reads requests in another form has a permit for them, which goes on.
         let charged = request.extensions().get::<Permit>().cloned();
         let permit = charged.unwrap_or_else(|| Permit::new(Arc::clone(budget)));
         request.extensions_mut().insert(permit.clone());

@@ -90,11 +90,13 @@ impl MessageBody {
         let Some([flag, length @ ..]) = self.buffer.first_chunk::<HEADER_BYTES>() else { return Ok(None) };
         let (flag, length) = (*flag, u32::from_be_bytes(*length) as usize);
         if length > self.max_bytes {
-            let text = format!("the message has {length} bytes, more than {}", self.max_bytes);
+            let text = format!("the message has {length} bytes, above the limit of {} bytes", self.max_bytes);
             return Err(Status::out_of_range(text));
         }
         let length = HEADER_BYTES + length;
         if self.buffer.len() < length {
+            // At once, as far as a chunk of an upload goes: a buffer that doubles leaves its smaller ones behind.
+            self.buffer.reserve((length - self.buffer.len()).min(inputs::MAX_MESSAGE_BYTES));
             return Ok(None);
         }
         // A part of the buffer would keep the whole in memory.
@@ -230,12 +232,18 @@ mod tests {
     const CREATE_JOB: &str = "/scpsfm.v1.JobService/CreateJob";
 
     fn given(bytes: &[u8], frame: usize, encoding: Option<&str>) -> (Vec<Bytes>, Option<Status>, u64) {
-        given_to(CREATE_JOB, bytes, frame, encoding)
+        given_to(CREATE_JOB, MAX_BYTES, bytes, frame, encoding)
     }
 
     /// What tonic is given of these bytes, which come in frames of that size, what refuses them, and what they are
     /// charged.
-    fn given_to(path: &str, bytes: &[u8], frame: usize, encoding: Option<&str>) -> (Vec<Bytes>, Option<Status>, u64) {
+    fn given_to(
+        path: &str,
+        max_bytes: usize,
+        bytes: &[u8],
+        frame: usize,
+        encoding: Option<&str>,
+    ) -> (Vec<Bytes>, Option<Status>, u64) {
         let body = Body::new(Frames(bytes.chunks(frame).map(Bytes::copy_from_slice).collect()));
         let mut request = Request::builder().uri(path);
         if let Some(encoding) = encoding {
@@ -243,7 +251,7 @@ mod tests {
         }
         let request = request.body(body).expect("a request");
         let (budget, record) = (Budget::new(u64::MAX), Arc::new(CallRecord::default()));
-        let request = MessageBody::in_place(request, MAX_BYTES, Permit::new(Arc::clone(&budget)), record);
+        let request = MessageBody::in_place(request, max_bytes, Permit::new(Arc::clone(&budget)), record);
         let is_taken = encoding == Some("gzip") && path.starts_with("/scpsfm");
         assert_eq!(request.headers().contains_key(ENCODING), encoding.is_some() && !is_taken);
         let mut messages = request.into_body();
@@ -313,7 +321,8 @@ mod tests {
             assert_eq!(found.concat(), bytes);
         }
         let health = framed(COMPRESSED, &gzip(&[0; 1_000]));
-        let (found, refusal, charged) = given_to("/grpc.health.v1.Health/Check", &health, 1_000, Some("gzip"));
+        let (found, refusal, charged) =
+            given_to("/grpc.health.v1.Health/Check", MAX_BYTES, &health, 1_000, Some("gzip"));
         assert!(refusal.is_none(), "{refusal:?}");
         assert_eq!((found.concat(), charged), (health.clone(), health.len() as u64));
     }
@@ -321,8 +330,26 @@ mod tests {
     #[test]
     fn chunks_of_uploads_have_their_own_bound() {
         let chunk = framed(COMPRESSED, &gzip(&vec![0; inputs::MAX_MESSAGE_BYTES + 1]));
-        let (_, refusal, charged) = given_to("/scpsfm.v1.InputService/UploadInput", &chunk, 1_000, Some("gzip"));
-        assert_eq!(refusal.expect("refused").code(), Code::OutOfRange);
+        let refused = |path: &str| {
+            let (_, refusal, charged) = given_to(path, 64 << 20, &chunk, 1_000, Some("gzip"));
+            (refusal.expect("refused").code(), charged)
+        };
+        let (code, charged) = refused("/scpsfm.v1.InputService/UploadInput");
+        assert_eq!(code, Code::OutOfRange);
         assert!(charged <= (inputs::MAX_MESSAGE_BYTES + chunk.len()) as u64, "{charged}");
+        // To others it is not too large, but malformed.
+        assert_eq!(refused(CREATE_JOB).0, Code::Internal);
+    }
+
+    #[test]
+    fn what_cannot_be_decoded_is_not_handed_on() {
+        // A set of six bytes whose numbers take a thousand.
+        let overlong = [&[0x2a, 6, 0x2a, 0xe8, 0x07][..], &[0; 1_000]].concat();
+        let compressed = framed(COMPRESSED, &gzip(&overlong));
+        for (message, encoding) in [(framed(UNCOMPRESSED, &overlong), None), (compressed, Some("gzip"))] {
+            let (found, refusal, _) = given(&message, 1_000, encoding);
+            assert!(found.is_empty());
+            assert_eq!(refusal.expect("refused").code(), Code::Internal, "tonic's word for it");
+        }
     }
 }

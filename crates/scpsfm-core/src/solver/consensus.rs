@@ -57,9 +57,9 @@ options! {
 }
 
 impl NoiseOptions {
-    /// The noise within the bounds of an estimate.
+    /// The noise within the bounds of an estimate; the least for what is no number.
     pub fn clamp(&self, noise: f64) -> f64 {
-        noise.clamp(self.bounds.0, self.bounds.1)
+        noise.max(self.bounds.0).min(self.bounds.1)
     }
 }
 

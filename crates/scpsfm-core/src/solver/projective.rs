@@ -3,7 +3,7 @@
 use nalgebra::{Matrix2, Matrix4, Vector2, Vector4};
 
 use super::block::Block;
-use super::consensus::{self, Consensus};
+use super::consensus::{self, Consensus, LEAST_VIEWS, NoiseOptions};
 use super::noise_model::evidence;
 use super::problem::Problem;
 use super::view_selection::evenly;
@@ -12,6 +12,18 @@ use crate::geometry::observation::Observation;
 use crate::geometry::statistics::core_noise;
 use crate::geometry::triangulation::weighted_squared;
 use crate::geometry::{Camera, Point};
+
+options! {
+    /// What a reconstruction measures.
+    pub struct ProjectiveOptions {
+        /// Spread of the points of a view across the line that fits them best, in units of the noise, from which they
+        /// measure two coordinates. Points on a line are spread by one; the noise is known to a factor of two. Any three
+        /// coordinates agree with some point: where they lie on lines, three views tell nothing of their tracks.
+        least_across: f64 = 4.0,
+    }
+}
+
+const OPTIONS: ProjectiveOptions = ProjectiveOptions::DEFAULT;
 
 /// Cameras and points up to a common projective transform, with the observations that agree with them.
 #[derive(Debug, Clone)]
@@ -66,10 +78,14 @@ impl ProjectiveReconstruction {
         projective::unknowns(self.views.len(), self.tracks.len())
     }
 
-    /// Coordinates that the views measure independently: two each, one where the points of a view lie on a line.
-    ///
-    /// * `least_across`: spread across that line from which they do not, in units of the noise
-    pub fn coordinates(&self, least_across: f64) -> usize {
+    /// Whether its views measure as many coordinates as three views do: two each, one where the points of a view lie on
+    /// a line.
+    pub fn measures_enough(&self) -> bool {
+        self.coordinates() >= 2 * LEAST_VIEWS
+    }
+
+    fn coordinates(&self) -> usize {
+        let least_across = OPTIONS.least_across * NoiseOptions::DEFAULT.clamp(self.noise);
         let mut of_view = vec![Vec::new(); self.views.len()];
         self.observations.iter().for_each(|seen| of_view[seen.view].push(seen.xy));
         let measured = |points: &Vec<Vector2<f64>>| {
@@ -77,7 +93,7 @@ impl ProjectiveReconstruction {
             let mean = points.iter().sum::<Vector2<f64>>() / count;
             let spread: Matrix2<f64> = points.iter().map(|xy| (xy - mean) * (xy - mean).transpose()).sum();
             let across = (spread / count).symmetric_eigenvalues().min().max(0.0).sqrt();
-            if across < least_across * self.noise { 1 } else { 2 }
+            if across < least_across { 1 } else { 2 }
         };
         of_view.iter().map(measured).sum()
     }

@@ -266,10 +266,13 @@ pub fn search_block(
     problem.stopped()?;
     let projective =
         attempt.found.consensus.as_ref().map(|consensus| ProjectiveReconstruction::of_block(&attempt.block, consensus));
-    attempt.projective = match attempt.judges_observations() {
-        true => projective.map(|found| found.weighed(problem).oriented()),
-        false => projective,
-    };
+    if attempt.judges_observations() {
+        let found = projective.map(|found| found.weighed(problem).oriented());
+        attempt.projective = found.filter(ProjectiveReconstruction::measures_enough);
+        attempt.found.consensus.take_if(|_| attempt.projective.is_none());
+    } else {
+        attempt.projective = projective;
+    }
     Ok(attempt)
 }
 

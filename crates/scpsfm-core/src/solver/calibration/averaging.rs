@@ -47,18 +47,19 @@ impl Choice<'_> {
     /// with distortion once for each kind of lens. An extension that the data can neither confirm nor refute thus costs
     /// what it would move.
     ///
+    /// * `priors`: those of the best model, or without what is known of a focal length
     /// * `inflation`: factor on all of them, for what a linearisation with independent noise does not see
-    pub fn sigmas(&self, selection: &Selection, inflation: f64) -> Sigmas {
+    pub fn sigmas(&self, selection: &Selection, priors: &[IntrinsicsPrior], inflation: f64) -> Sigmas {
         let best = &selection.best;
         let views = best.minimum.reconstruction.focals.len();
-        let here = best.sigma_log_focal().and_then(|_| best.optimum(best.model, &best.priors));
+        let here = best.sigma_log_focal().and_then(|_| best.optimum(best.model, priors));
         let Some(here) = here else {
             let of_group = vec![[None; Parameter::COUNT]; self.problem.groups()];
             return Sigmas { of_group, view_focals: vec![None; views] };
         };
         let unit = best.fit.noise.powi(2);
         let models: Vec<Weighed> =
-            best.model.with_any_extensions().flat_map(|model| self.weighed(selection, model)).collect();
+            best.model.with_any_extensions().flat_map(|model| self.weighed(selection, model, priors)).collect();
         let highest = models.iter().map(|model| model.log_weight).fold(f64::NEG_INFINITY, f64::max);
         let weights: Vec<f64> = models.iter().map(|model| (model.log_weight - highest).exp()).collect();
         let total: f64 = weights.iter().sum();
@@ -95,7 +96,12 @@ impl Choice<'_> {
     /// A model for each kind of lens that it may be of, from the candidate that was adjusted with most nearly the same
     /// extensions: where the observations are weak, a linearisation predicts only half of the gain that an
     /// adjustment finds.
-    fn weighed<'c>(&self, selection: &'c Selection, model: IntrinsicsModel) -> Vec<Weighed<'c>> {
+    fn weighed<'c>(
+        &self,
+        selection: &'c Selection,
+        model: IntrinsicsModel,
+        priors: &[IntrinsicsPrior],
+    ) -> Vec<Weighed<'c>> {
         let Selection { best, tried } = selection;
         let differing = |candidate: &Candidate| {
             let extensions = Extension::ALL.into_iter();
@@ -108,7 +114,7 @@ impl Choice<'_> {
         let Some(from) = adjusted.min_by_key(|candidate| differing(candidate)) else { return Vec::new() };
         let of_kind = |(share, narrowing): (f64, f64)| {
             let narrowed = |prior: &IntrinsicsPrior| prior.narrowed(Parameter::RadialK1, narrowing);
-            let priors: Vec<IntrinsicsPrior> = best.priors.iter().map(narrowed).collect();
+            let priors: Vec<IntrinsicsPrior> = priors.iter().map(narrowed).collect();
             let optimum = from.optimum(model, &priors)?;
             let gain = (best.fit.cost - from.fit.cost - optimum.delta_cost) / best.fit.noise.powi(2);
             let log_weight = share.ln() + self.log_prior(model, &priors) + 0.5 * gain - 0.5 * optimum.log_determinant;

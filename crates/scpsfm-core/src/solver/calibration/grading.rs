@@ -38,7 +38,8 @@ pub(super) fn grade(
     let profile = choice.profile(best);
     // Both are of the same residuals, seen from two sides.
     let correlation = (profile.correlation / comparison.violation).max(1.0);
-    let sigmas = choice.sigmas(&selection, comparison.violation * profile.widening);
+    let inflation = comparison.violation * profile.widening;
+    let sigmas = choice.sigmas(&selection, &best.priors, inflation);
     let sigmas = sigmas.widened(correlation, choice.problem.focal_priors);
     let has_own_focals = best.minimum.reconstruction.has_own_focals();
     let mut focals = view_focals::of(best, &sigmas, lenses);
@@ -64,6 +65,15 @@ pub(super) fn grade(
             false => {
                 let of_focal = sigmas.of_group[group][Parameter::LogFocal as usize];
                 let mut sigma = of_focal.filter(|sigma| *sigma < grades.unobservable_above);
+                // It lifts the grade by one step at most.
+                let alone =
+                    || choice.sigmas(&selection, &without_focal(best, group), inflation * correlation).of_group[group];
+                let is_observable = |sigma: f64| sigma <= grades.weak_up_to;
+                if choice.problem.focal_priors[group].is_some()
+                    && !alone()[Parameter::LogFocal as usize].is_some_and(is_observable)
+                {
+                    verdict.grade = verdict.grade.worse(Grade::Weak);
+                }
                 weigh_prior(&mut verdict, &mut sigma, choice, best, group, &comparison, correlation);
                 verdict.judge_sigma(sigma, correlation);
                 (of_focal, sigma)
@@ -198,7 +208,7 @@ fn of_data(best: &Candidate, group: usize, inflation: f64) -> Option<f64> {
     Some(sigma * inflation)
 }
 
-/// What a prior on the focal length may not do: contradict the observations unsaid, or make a calibration of nothing.
+/// What a prior on the focal length may not do: contradict the observations unsaid.
 ///
 /// Where it contradicts them, sigma grows by as many standard deviations (Birge's ratio of two values): one of the two
 /// is wrong, and which is not known.
@@ -216,13 +226,6 @@ fn weigh_prior(
 ) {
     let Some(focal_prior) = choice.problem.focal_priors[group] else { return };
     let of_data = of_data(best, group, comparison.violation * correlation);
-    // What the observations add to it, with all doubt about the model.
-    let added = sigma.map_or(0.0, |sigma| sigma.powi(-2)) - focal_prior.sigma_log.powi(-2);
-    let is_observable = |sigma: f64| sigma <= choice.problem.options.grades.weak_up_to;
-    // It lifts the grade by one step at most.
-    if !of_data.is_some_and(is_observable) || !is_observable(added.max(0.0).powf(-0.5)) {
-        verdict.grade = verdict.grade.worse(Grade::Weak);
-    }
     let alone = without_focal(best, group);
     let contradicts = |difference: f64, of_data: f64| {
         let deviations = difference.abs() / of_data.hypot(focal_prior.sigma_log);

@@ -114,10 +114,6 @@ options! {
         /// Growth of the retained observations, once each is judged by itself, from which a whole input is extended.
         /// With a tenth more of them sigma falls by a twentieth.
         worth_extending: f64 = 1.1,
-        /// Spread of the points of a view across the line that fits them best, in units of the noise, from which they
-        /// measure two coordinates. Points on a line are spread by one; the noise is known to a factor of two. Any three
-        /// coordinates agree with some point: where they lie on lines, three views tell nothing of their tracks.
-        least_across: f64 = 4.0,
         /// Subsets that are tried of a whole input before it is searched at length.
         first_subsets: usize = 3,
         /// Evidence of a reconstruction, in that of one that was calibrated and has all of its views, from which it is

@@ -220,7 +220,7 @@ impl<'a> Growing<'a> {
         let unknowns = bundle::projective::unknowns(reconstruction.views.len(), reconstruction.tracks.len());
         let noise = core_noise(norms, unknowns)?;
         let options = NoiseOptions::DEFAULT;
-        Some(noise.clamp(options.bounds.0, options.clamp(self.options.noise_growth * self.start_noise)))
+        Some(options.clamp(noise).min(options.clamp(self.options.noise_growth * self.start_noise)))
     }
 
     /// Takes back the views that too few points hold, and returns them.

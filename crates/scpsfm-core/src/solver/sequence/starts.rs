@@ -5,7 +5,7 @@ use super::projective_growth;
 use super::triplets::Pairs;
 use crate::domain::Stage;
 use crate::solver::attempt::{self, Attempt, Effort};
-use crate::solver::consensus::{self, LEAST_INLIERS};
+use crate::solver::consensus::LEAST_INLIERS;
 use crate::solver::error::Error;
 use crate::solver::learned::TrackScoreOptions;
 use crate::solver::problem::Problem;
@@ -122,8 +122,7 @@ pub fn extend_projectively(
         options = GrowthOptions { gives_points: false, adjust_growth: f64::INFINITY, final_rounds: 1, ..options };
     }
     let extended = projective_growth::extend(problem, start, &options, recorder)?;
-    let coordinates = extended.coordinates(ExtensionOptions::DEFAULT.least_across);
-    let is_enough = coordinates >= 2 * consensus::LEAST_VIEWS && extended.tracks.len() >= least;
+    let is_enough = extended.measures_enough() && extended.tracks.len() >= least;
     attempt.projective = before;
     if is_enough && !attempt.outweighs(&extended.views, extended.noise) {
         attempt.projective = Some(extended);

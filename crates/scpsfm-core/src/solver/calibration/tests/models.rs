@@ -186,6 +186,29 @@ fn a_prior_helps_where_the_motion_says_little_and_is_contradicted_where_it_says_
 }
 
 /// However far away what the tracks say is.
+/// A prior at the true focal length, however sure, takes nothing from what the observations say, and lifts the grade by
+/// one step at most.
+#[test]
+fn a_right_prior_lifts_the_grade_by_one_step_or_not_at_all() {
+    let rank = |grade: Grade| [Grade::ProjectiveOnly, Grade::Weak, Grade::Metric].iter().position(|of| *of == grade);
+    let mut lifted = 0;
+    for (turning, seed) in
+        [0.02, 0.05, 0.1, 0.2].into_iter().flat_map(|turning| (0..3).map(move |seed| (turning, seed)))
+    {
+        let scene = testing::scene_turning(seed, 40, 0.001, turning);
+        let alone = calibrated(&scene, seed, 0.001);
+        for sigma_log in [0.005, 0.01, 0.02] {
+            let prior = FocalPrior { focal_px: scene.intrinsics.focal * SIDE_PX, sigma_log };
+            let helped = calibrated_knowing(&scene, seed, 0.001, Some(prior));
+            println!("turning {turning}, seed {seed}, {sigma_log}: {:?} to {:?}", alone.grade, helped.grade);
+            let [from, to] = [alone.grade, helped.grade].map(rank);
+            assert!(from <= to && to <= from.map(|from| from + 1), "{:?} to {:?}", alone.grade, helped.grade);
+            lifted += usize::from(from < to);
+        }
+    }
+    assert!(lifted > 0, "no scene leaves anything to a prior");
+}
+
 #[test]
 fn what_the_tracks_say_against_a_prior_is_what_they_say_without_it() {
     for seed in 0..5 {
