@@ -17,8 +17,7 @@ options! {
     /// What a reconstruction measures.
     pub struct ProjectiveOptions {
         /// Spread of the points of a view across the line that fits them best, in units of the noise, from which they
-        /// measure two coordinates. Points on a line are spread by one; the noise is known to a factor of two. Any three
-        /// coordinates agree with some point: where they lie on lines, three views tell nothing of their tracks.
+        /// lie off it. Points on a line are spread by one; the noise is known to a factor of two.
         least_across: f64 = 4.0,
     }
 }
@@ -78,24 +77,19 @@ impl ProjectiveReconstruction {
         projective::unknowns(self.views.len(), self.tracks.len())
     }
 
-    /// Whether its views measure as many coordinates as three views do: two each, one where the points of a view lie on
-    /// a line.
-    pub fn measures_enough(&self) -> bool {
-        self.coordinates() >= 2 * LEAST_VIEWS
-    }
-
-    fn coordinates(&self) -> usize {
+    /// Whether the points of three views or more lie off a line: those on one measure one coordinate, where chance is
+    /// reckoned with two.
+    pub fn is_off_lines(&self) -> bool {
         let least_across = OPTIONS.least_across * NoiseOptions::DEFAULT.clamp(self.noise);
         let mut of_view = vec![Vec::new(); self.views.len()];
         self.observations.iter().for_each(|seen| of_view[seen.view].push(seen.xy));
-        let measured = |points: &Vec<Vector2<f64>>| {
+        let is_off_line = |points: &&Vec<Vector2<f64>>| {
             let count = points.len().max(1) as f64;
             let mean = points.iter().sum::<Vector2<f64>>() / count;
             let spread: Matrix2<f64> = points.iter().map(|xy| (xy - mean) * (xy - mean).transpose()).sum();
-            let across = (spread / count).symmetric_eigenvalues().min().max(0.0).sqrt();
-            if across < least_across { 1 } else { 2 }
+            (spread / count).symmetric_eigenvalues().min().max(0.0).sqrt() >= least_across
         };
-        of_view.iter().map(measured).sum()
+        of_view.iter().filter(is_off_line).count() >= LEAST_VIEWS
     }
 
     /// The tracks with most observations, evenly among equals: a calibration takes no more than these.

@@ -268,7 +268,7 @@ pub fn search_block(
         attempt.found.consensus.as_ref().map(|consensus| ProjectiveReconstruction::of_block(&attempt.block, consensus));
     if attempt.judges_observations() {
         let found = projective.map(|found| found.weighed(problem).oriented());
-        attempt.projective = found.filter(ProjectiveReconstruction::measures_enough);
+        attempt.projective = found.filter(ProjectiveReconstruction::is_off_lines);
         attempt.found.consensus.take_if(|_| attempt.projective.is_none());
     } else {
         attempt.projective = projective;

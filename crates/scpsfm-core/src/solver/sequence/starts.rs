@@ -122,7 +122,7 @@ pub fn extend_projectively(
         options = GrowthOptions { gives_points: false, adjust_growth: f64::INFINITY, final_rounds: 1, ..options };
     }
     let extended = projective_growth::extend(problem, start, &options, recorder)?;
-    let is_enough = extended.measures_enough() && extended.tracks.len() >= least;
+    let is_enough = extended.is_off_lines() && extended.tracks.len() >= least;
     attempt.projective = before;
     if is_enough && !attempt.outweighs(&extended.views, extended.noise) {
         attempt.projective = Some(extended);

@@ -81,7 +81,7 @@ fn pairs_of_views_without_structure_are_no_reconstruction() {
     }
 }
 
-/// Where the points of three views lie on a line in each, every track agrees with some point.
+/// Where the points of three views lie on a line in each, every track agrees with some point; in more views, many do.
 #[test]
 fn points_on_a_line_in_each_view_are_no_reconstruction() {
     for (seed, (views, tracks)) in (0..).zip([(3, 40), (4, 60), (6, 40), (12, 80), (20, 50)]) {
