@@ -65,7 +65,7 @@ pub(super) fn grade(
             false => {
                 let of_focal = sigmas.of_group[group][Parameter::LogFocal as usize];
                 let mut sigma = of_focal.filter(|sigma| *sigma < grades.unobservable_above);
-                // It lifts the grade by one step at most.
+                // A prior lifts the grade by one step at most.
                 let alone =
                     || choice.sigmas(&selection, &without_focal(best, group), inflation * correlation).of_group[group];
                 let is_observable = |sigma: f64| sigma <= grades.weak_up_to;
