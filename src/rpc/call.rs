@@ -192,10 +192,10 @@ fn add_details(headers: &mut HeaderMap) {
 
 #[cfg(test)]
 mod tests {
-    use std::collections::VecDeque;
     use std::convert::Infallible;
 
     use governor::clock::DefaultClock;
+    use http_body_util::StreamBody;
     use metrics_exporter_prometheus::PrometheusBuilder;
     use tonic::Code;
     use tonic::codegen::http::HeaderValue;
@@ -211,21 +211,6 @@ mod tests {
         CallLayer { authenticate, budget, max_message_bytes: usize::MAX, refusals }
     }
 
-    /// A body of given frames.
-    struct Frames(VecDeque<Frame<Bytes>>);
-
-    impl HttpBody for Frames {
-        type Data = Bytes;
-        type Error = Status;
-
-        fn poll_frame(
-            mut self: Pin<&mut Self>,
-            _context: &mut Context<'_>,
-        ) -> Poll<Option<Result<Frame<Bytes>, Status>>> {
-            Poll::Ready(self.0.pop_front().map(Ok))
-        }
-    }
-
     fn with_status(code: &'static str) -> HeaderMap {
         HeaderMap::from_iter([("grpc-status".parse().expect("a header"), HeaderValue::from_static(code))])
     }
@@ -234,7 +219,8 @@ mod tests {
     fn counted_as(headers: HeaderMap, frames: Vec<Frame<Bytes>>, read: usize) -> String {
         let recorder = PrometheusBuilder::new().build_recorder();
         metrics::with_local_recorder(&recorder, || {
-            let mut answer = Response::new(Body::new(Frames(frames.into())));
+            let frames = tokio_stream::iter(frames.into_iter().map(Ok::<_, Status>));
+            let mut answer = Response::new(Body::new(StreamBody::new(frames)));
             *answer.headers_mut() = headers;
             let mut answer = Some(answer);
             let inner = tower::service_fn(move |_: Request<Body>| {

@@ -185,11 +185,11 @@ impl HttpBody for MessageBody {
 
 #[cfg(test)]
 mod tests {
-    use std::collections::VecDeque;
     use std::io::Write;
 
     use flate2::Compression;
     use flate2::write::GzEncoder;
+    use http_body_util::StreamBody;
     use prost::Message;
     use tonic::Code;
 
@@ -197,20 +197,6 @@ mod tests {
     use crate::rpc::inflight::Budget;
     use crate::rpc::proto::create_job_request::Source;
     use crate::rpc::proto::{CreateJobRequest, TrackSet, View};
-
-    struct Frames(VecDeque<Bytes>);
-
-    impl HttpBody for Frames {
-        type Data = Bytes;
-        type Error = Status;
-
-        fn poll_frame(
-            mut self: Pin<&mut Self>,
-            _context: &mut Context<'_>,
-        ) -> Poll<Option<Result<Frame<Bytes>, Status>>> {
-            Poll::Ready(self.0.pop_front().map(|data| Ok(Frame::data(data))))
-        }
-    }
 
     fn framed(flag: u8, message: &[u8]) -> Vec<u8> {
         [&[flag][..], &(message.len() as u32).to_be_bytes(), message].concat()
@@ -244,7 +230,9 @@ mod tests {
         frame: usize,
         encoding: Option<&str>,
     ) -> (Vec<Bytes>, Option<Status>, u64) {
-        let body = Body::new(Frames(bytes.chunks(frame).map(Bytes::copy_from_slice).collect()));
+        let frames: Vec<_> =
+            bytes.chunks(frame).map(|data| Ok::<_, Status>(Frame::data(Bytes::copy_from_slice(data)))).collect();
+        let body = Body::new(StreamBody::new(tokio_stream::iter(frames)));
         let mut request = Request::builder().uri(path);
         if let Some(encoding) = encoding {
             request = request.header(ENCODING, encoding);

@@ -26,7 +26,7 @@ use super::call::{CallLayer, CallService};
 use super::caller::Tenant;
 use super::health::Health;
 use super::inflight::{Budget, Permit};
-use super::inputs::{self, Inputs};
+use super::inputs::Inputs;
 use super::jobs::Jobs;
 use super::keys::{self, KeyRing};
 use super::listener::{self, ConnectionInfo, Listener};
@@ -376,10 +376,7 @@ fn services(options: &Options, engine: Engine) -> Result<Routes, Error> {
     let services = Routes::new(with_limits!(CalibrationServiceServer::new(calibration)))
         .add_service(with_limits!(AdminServiceServer::new(Admin::new(engine.clone()))))
         .add_service(with_limits!(JobServiceServer::new(Jobs::new(engine, limits, max_bytes as u64))))
-        .add_service(
-            with_limits!(InputServiceServer::new(inputs))
-                .max_decoding_message_size(max_bytes.min(inputs::MAX_MESSAGE_BYTES)),
-        );
+        .add_service(with_limits!(InputServiceServer::new(inputs)));
     if !options.reflection {
         return Ok(services);
     }

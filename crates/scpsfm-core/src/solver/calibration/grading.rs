@@ -65,14 +65,12 @@ pub(super) fn grade(
             false => {
                 let of_focal = sigmas.of_group[group][Parameter::LogFocal as usize];
                 let mut sigma = of_focal.filter(|sigma| *sigma < grades.unobservable_above);
-                // A prior lifts the grade by one step at most.
-                let alone =
-                    || choice.sigmas(&selection, &without_focal(best, group), inflation * correlation).of_group[group];
-                let is_observable = |sigma: f64| sigma <= grades.weak_up_to;
-                if choice.problem.focal_priors[group].is_some()
-                    && !alone()[Parameter::LogFocal as usize].is_some_and(is_observable)
-                {
-                    verdict.grade = verdict.grade.worse(Grade::Weak);
+                if choice.problem.focal_priors[group].is_some() {
+                    // It lifts the grade by one step at most.
+                    let alone = choice.sigmas(&selection, &without_focal(best, group), inflation * correlation);
+                    if grades.grade(alone.of_group[group][Parameter::LogFocal as usize]) == Grade::ProjectiveOnly {
+                        verdict.grade = verdict.grade.worse(Grade::Weak);
+                    }
                 }
                 weigh_prior(&mut verdict, &mut sigma, choice, best, group, &comparison, correlation);
                 verdict.judge_sigma(sigma, correlation);

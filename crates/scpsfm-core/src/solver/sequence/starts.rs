@@ -73,8 +73,8 @@ pub fn by_projective_extension(
             continue;
         }
         attempt::calibrate(problem, &mut attempt, &[], recorder)?;
-        let worth = |attempt: &Attempt| worth(attempt.evidence(problem), attempt.is_calibrated());
-        if best.as_ref().is_none_or(|best| outweighs(&attempt, best) || worth(&attempt) > worth(best)) {
+        if best.as_ref().is_none_or(|best| outweighs(&attempt, best) || worth(&attempt, problem) > worth(best, problem))
+        {
             best = Some(attempt);
         }
         if best.as_ref().is_some_and(Attempt::is_good) {
@@ -84,11 +84,11 @@ pub fn by_projective_extension(
     Ok(best.or(unsolved))
 }
 
-/// What a reconstruction is worth: its evidence, not below 0, and with a calibration
+/// What an attempt is worth: its evidence, not below 0, and with a calibration
 /// [`ExtensionOptions::worth_of_calibration`] times that.
-fn worth(evidence: f64, is_calibrated: bool) -> f64 {
-    let factor = if is_calibrated { ExtensionOptions::DEFAULT.worth_of_calibration } else { 1.0 };
-    factor * evidence.max(0.0)
+fn worth(attempt: &Attempt, problem: &Problem) -> f64 {
+    let factor = if attempt.is_calibrated() { ExtensionOptions::DEFAULT.worth_of_calibration } else { 1.0 };
+    factor * attempt.evidence(problem).max(0.0)
 }
 
 /// Whether an attempt is verified by depths, and worth more than another that is not, see [`Attempt::outweighs`].

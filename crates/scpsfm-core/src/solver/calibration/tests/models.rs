@@ -185,7 +185,6 @@ fn a_prior_helps_where_the_motion_says_little_and_is_contradicted_where_it_says_
     }
 }
 
-/// However far away what the tracks say is.
 /// A prior at the true focal length, however sure, takes nothing from what the observations say, and lifts the grade by
 /// one step at most.
 #[test]
@@ -209,6 +208,7 @@ fn a_right_prior_lifts_the_grade_by_one_step_or_not_at_all() {
     assert!(lifted > 0, "no scene leaves anything to a prior");
 }
 
+/// However far away what the tracks say is.
 #[test]
 fn what_the_tracks_say_against_a_prior_is_what_they_say_without_it() {
     for seed in 0..5 {
