@@ -219,7 +219,7 @@ mod tests {
     fn counted_as(headers: HeaderMap, frames: Vec<Frame<Bytes>>, read: usize) -> String {
         let recorder = PrometheusBuilder::new().build_recorder();
         metrics::with_local_recorder(&recorder, || {
-            let frames = tokio_stream::iter(frames.into_iter().map(Ok::<_, Status>));
+            let frames = futures_util::stream::iter(frames.into_iter().map(Ok::<_, Status>));
             let mut answer = Response::new(Body::new(StreamBody::new(frames)));
             *answer.headers_mut() = headers;
             let mut answer = Some(answer);

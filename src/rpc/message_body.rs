@@ -232,7 +232,7 @@ mod tests {
     ) -> (Vec<Bytes>, Option<Status>, u64) {
         let frames: Vec<_> =
             bytes.chunks(frame).map(|data| Ok::<_, Status>(Frame::data(Bytes::copy_from_slice(data)))).collect();
-        let body = Body::new(StreamBody::new(tokio_stream::iter(frames)));
+        let body = Body::new(StreamBody::new(futures_util::stream::iter(frames)));
         let mut request = Request::builder().uri(path);
         if let Some(encoding) = encoding {
             request = request.header(ENCODING, encoding);
