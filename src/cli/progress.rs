@@ -111,9 +111,9 @@ pub struct TransferView {
 
 impl TransferView {
     /// A bar when stderr is a terminal, nothing elsewhere: a transfer is short, and its end says that it was done.
-    pub fn new(quiet: bool, bytes: u64) -> Self {
+    pub fn new(quiet: bool) -> Self {
         let bar = (!quiet && std::io::stderr().is_terminal()).then(|| {
-            let bar = ProgressBar::new(bytes);
+            let bar = ProgressBar::no_length();
             if let Ok(style) = ProgressStyle::with_template(
                 "{bytes:>10} of {total_bytes} [{bar:24}] {percent:>3}% {bytes_per_sec}, {eta}",
             ) {
@@ -124,9 +124,10 @@ impl TransferView {
         Self { bar }
     }
 
-    /// So many bytes are done.
-    pub fn show(&mut self, bytes: u64) {
+    /// So many bytes of the total are done.
+    pub fn show(&mut self, bytes: u64, total: u64) {
         if let Some(bar) = &self.bar {
+            bar.set_length(total);
             bar.set_position(bytes);
         }
     }

@@ -10,9 +10,10 @@ use super::access::AccessArgs;
 use super::args::ServerArgs;
 use super::exit::{Exit, Failure};
 use super::input_args::{ReadingArgs, tell_notes};
+use super::progress::TransferView;
 use super::settings_args::SettingsArgs;
 use super::{job_view, print, remote};
-use crate::client::JobOptions;
+use crate::client::{JobInput, JobOptions};
 use crate::domain::{InputName, Webhook};
 use crate::formats::STANDARD_INPUT;
 use crate::rpc::convert::create::MAX_PRIORITY;
@@ -28,7 +29,7 @@ Examples:
 /// Leave jobs with a server
 ///
 /// Prints each job's name. The jobs go on without this command, and over restarts of the server. Of several inputs each
-/// is a job of its own, with the same settings; all of them are stored, or none.
+/// is a job of its own, with the same settings; all of them are stored, or none. Large inputs are uploaded first.
 #[derive(Debug, clap::Args)]
 #[command(after_help = EXAMPLES, after_long_help = format!("{EXAMPLES}\n\n{}", super::exit::HELP))]
 pub struct Args {
@@ -117,21 +118,24 @@ pub async fn run(args: Args) -> Result<Exit, Failure> {
         time_limit: args.time_limit,
         webhook_url: args.webhook_url,
     };
+    let mut inputs = Vec::new();
+    for input in &read {
+        let mut view = TransferView::new(false);
+        let sent = client.upload_large(input, &mut |bytes, total| view.show(bytes, total)).await;
+        inputs.push(sent.map_err(|error| remote::at_lines(error, input))?);
+    }
+    inputs.extend(named.into_iter().map(JobInput::Uploaded));
     if several {
-        // Tracks, which are less than keypoints and matches: all inputs share one message.
-        let inputs = read.iter().map(|input| &input.raw);
-        let created = client.create_batch(inputs, &named, &settings, &options).await;
+        let created = client.create_batch(inputs, &settings, &options).await;
         let jobs = created.map_err(|error| remote::at_lines_of(error, &read))?;
         return jobs.iter().try_for_each(|job| print(&job.name.to_string())).map(|()| Exit::Done);
     }
-    let job = match (read.first(), named.first()) {
-        (Some(input), _) => {
-            let created = client.create(input, &settings, options).await;
-            created.map_err(|error| remote::at_lines(error, input))?
-        }
-        (None, Some(name)) => client.create_with(name, &settings, options).await?,
-        (None, None) => return Err(nothing()),
-    };
+    let input = inputs.pop().ok_or_else(nothing)?;
+    let created = client.create(input, &settings, options).await;
+    let job = created.map_err(|error| match read.first() {
+        Some(input) => remote::at_lines(error, input),
+        None => error.into(),
+    })?;
     print(&job.name.to_string())?;
     if args.watch {
         job_view::watch_to_end(&mut client, &args.server, &job.name, 0, false).await

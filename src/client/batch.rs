@@ -1,15 +1,15 @@
 //! Several jobs in one call, all or none.
 
 use super::backoff::Backoff;
-use super::jobs::{JobOptions, create_request};
-use super::{Client, Error};
+use super::jobs::{JobOptions, MAX_INLINE_BYTES, create_request};
+use super::{Client, Error, JobInput};
 use crate::domain::job::Job;
-use crate::domain::{InputName, RawInput, SolveSettings};
-use crate::rpc::convert;
-use crate::rpc::proto::{self, create_job_request::Source as JobInput};
+use crate::domain::{SolveSettings, Violation};
+use crate::rpc::{convert, proto};
 
 impl Client {
-    /// Creates a job of each input, then of each that was uploaded; in that order, all of them or none.
+    /// Creates a job of each input, in their order, all of them or none. What together is too large for a call is
+    /// [uploaded](Self::upload) first.
     ///
     /// A request id that is given stands, with the number of the job after it, for each of them.
     ///
@@ -17,18 +17,18 @@ impl Client {
     /// See [`Error`]; its fields begin with the number of the request that is refused, as `requests[3].track_set.xs`.
     pub async fn create_batch(
         &mut self,
-        inputs: impl Iterator<Item = &RawInput>,
-        uploaded: &[InputName],
+        inputs: impl IntoIterator<Item = JobInput>,
         settings: &SolveSettings,
         options: &JobOptions,
     ) -> Result<Vec<Job>, Error> {
-        let inline = inputs.map(|input| JobInput::TrackSet(convert::input::to_wire(input.clone())));
-        let named = uploaded.iter().map(|name| JobInput::Input(name.to_string()));
-        let requests = (1..).zip(inline.chain(named)).map(|(number, input)| {
-            let request_id = options.request_id.as_ref().map(|id| format!("{id}-{number}"));
-            create_request(self.parent(), input, settings, JobOptions { request_id, ..options.clone() })
-        });
-        let request = proto::BatchCreateJobsRequest { parent: self.parent(), requests: requests.collect() };
+        let (mut requests, mut room) = (Vec::new(), MAX_INLINE_BYTES);
+        for (index, input) in inputs.into_iter().enumerate() {
+            let source = self.source(input, &mut room).await.map_err(|error| of_request(error, index))?;
+            let request_id = options.request_id.as_ref().map(|id| format!("{id}-{}", index + 1));
+            let options = JobOptions { request_id, ..options.clone() };
+            requests.push(create_request(self.parent(), source, settings, options));
+        }
+        let request = proto::BatchCreateJobsRequest { parent: self.parent(), requests };
         let mut backoff = Backoff::default();
         loop {
             // Each request has an id: what was stored by a call whose answer was lost is answered again.
@@ -41,4 +41,12 @@ impl Client {
             }
         }
     }
+}
+
+/// The error of an upload, whose fields name its request as those of the call itself do.
+fn of_request(mut error: Error, index: usize) -> Error {
+    for Violation { field, .. } in &mut error.violations {
+        *field = format!("requests[{index}].{field}");
+    }
+    error
 }

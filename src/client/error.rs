@@ -134,9 +134,9 @@ fn of_status(server: &str, status: &Status, answered: bool) -> Error {
         // Sound, and more than this server ever takes: neither the usage nor a line of the input is wrong.
         Code::InvalidArgument if is_too_large(status) => Refused.error(format!("{server}: {message}")),
         Code::InvalidArgument => Error { violations: violations(status), ..Invalid.error(message) },
-        // What the transport says of a message above the server's limit.
-        Code::OutOfRange => Refused.error(format!("{message}; `solve` and `upload` send a large input in parts")),
-        Code::NotFound | Code::AlreadyExists | Code::FailedPrecondition | Code::Aborted => Refused.error(message),
+        Code::NotFound | Code::AlreadyExists | Code::FailedPrecondition | Code::Aborted | Code::OutOfRange => {
+            Refused.error(message)
+        }
         Code::PermissionDenied => NotLetIn.error(format!("{server}: {message}")),
         Code::Unauthenticated => {
             NotLetIn.error(format!("{server}: {message}; a key goes into `api_key`")).about(Setting::ApiKey)

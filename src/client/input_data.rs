@@ -2,7 +2,9 @@
 
 use std::sync::Arc;
 
-use crate::domain::{RawInput, RawMatches};
+use prost::Message as _;
+
+use crate::domain::{InputName, RawInput, RawMatches};
 use crate::rpc::convert::input_message::InputMessage;
 use crate::rpc::convert::{input, matches};
 use crate::rpc::proto::{self, create_job_request::Source, input_data::Data, solve_request::Message};
@@ -32,7 +34,30 @@ impl From<RawMatches> for InputData {
     }
 }
 
+/// What a job is created with.
+#[derive(Debug, Clone)]
+pub enum JobInput {
+    /// Sent with the call, or uploaded before it where it is large.
+    Data(InputData),
+    /// Uploaded before.
+    Uploaded(InputName),
+}
+
+impl<T: Into<InputData>> From<T> for JobInput {
+    fn from(data: T) -> Self {
+        Self::Data(data.into())
+    }
+}
+
 impl InputData {
+    /// Its length as a message, in bytes.
+    pub(super) fn encoded_len(&self) -> usize {
+        match self {
+            Self::TrackSet(set) => set.encoded_len(),
+            Self::MatchSet(set) => set.encoded_len(),
+        }
+    }
+
     /// The whole, as a job is created with it.
     pub(super) fn into_source(self) -> Source {
         match self {

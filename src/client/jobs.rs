@@ -9,11 +9,15 @@ use sha2::{Digest, Sha256};
 use tonic::{Status, Streaming};
 
 use super::backoff::Backoff;
-use super::{Client, Error, InputData, OWN_TENANT};
+use super::{Client, EncodedInput, Error, JobInput, OWN_TENANT};
 use crate::domain::job::{EventBody, Failure, Job, JobEvent, JobName, JobState};
 use crate::domain::{InputName, Solution, SolveSettings};
 use crate::rpc::convert;
-use crate::rpc::proto::{self, create_job_request::Source as JobInput};
+use crate::rpc::proto::{self, create_job_request::Source};
+
+/// Most bytes of inputs that are sent with a call: what the least `server.max_message_bytes` takes beside settings and
+/// labels.
+pub(super) const MAX_INLINE_BYTES: usize = 512 << 10;
 
 /// What a caller says of a job beside input and settings.
 #[derive(Debug, Clone, Default)]
@@ -42,39 +46,19 @@ pub struct Page {
 }
 
 impl Client {
-    /// Creates a job that lives on without this client.
+    /// Creates a job that lives on without this client. A large input is [uploaded](Self::upload) first.
     ///
     /// # Errors
     /// See [`Error`].
     pub async fn create(
         &mut self,
-        input: impl Into<InputData>,
+        input: impl Into<JobInput>,
         settings: &SolveSettings,
         options: JobOptions,
     ) -> Result<Job, Error> {
-        self.create_of(input.into().into_source(), settings, options).await
-    }
-
-    /// The same with an input that was uploaded.
-    ///
-    /// # Errors
-    /// See [`Error`].
-    pub async fn create_with(
-        &mut self,
-        input: &InputName,
-        settings: &SolveSettings,
-        options: JobOptions,
-    ) -> Result<Job, Error> {
-        self.create_of(JobInput::Input(input.to_string()), settings, options).await
-    }
-
-    async fn create_of(
-        &mut self,
-        input: JobInput,
-        settings: &SolveSettings,
-        options: JobOptions,
-    ) -> Result<Job, Error> {
-        let request = create_request(self.parent(), input, settings, options);
+        let mut room = MAX_INLINE_BYTES;
+        let source = self.source(input.into(), &mut room).await?;
+        let request = create_request(self.parent(), source, settings, options);
         let mut backoff = Backoff::default();
         loop {
             match backoff.within(self.jobs.create_job(request.clone())).await {
@@ -82,6 +66,41 @@ impl Client {
                 Err(status) => self.pause_to_store(&mut backoff, status).await?,
             }
         }
+    }
+
+    /// Uploads an input that is too large to be sent with a call; any other comes back as it is. `on_progress` is told
+    /// how many bytes of how many the server has.
+    ///
+    /// # Errors
+    /// See [`Error`].
+    pub async fn upload_large(
+        &mut self,
+        input: impl Into<JobInput>,
+        on_progress: &mut (dyn FnMut(u64, u64) + Send),
+    ) -> Result<JobInput, Error> {
+        match input.into() {
+            JobInput::Data(data) if data.encoded_len() > MAX_INLINE_BYTES => {
+                let input = EncodedInput::new(data);
+                let total = input.len();
+                Ok(JobInput::Uploaded(self.upload(&input, &mut |bytes| on_progress(bytes, total)).await?))
+            }
+            other => Ok(other),
+        }
+    }
+
+    /// An input as a request has it: within the message where there is `room` for it, which it takes, uploaded elsewhere.
+    pub(super) async fn source(&mut self, input: JobInput, room: &mut usize) -> Result<Source, Error> {
+        let name = match input {
+            JobInput::Data(data) => match room.checked_sub(data.encoded_len()) {
+                Some(left) => {
+                    *room = left;
+                    return Ok(data.into_source());
+                }
+                None => self.upload(&EncodedInput::new(data), &mut |_| ()).await?,
+            },
+            JobInput::Uploaded(name) => name,
+        };
+        Ok(Source::Input(name.to_string()))
     }
 
     /// A job as it stands.
@@ -323,7 +342,7 @@ pub fn ended_as(name: &JobName, state: JobState, failure: Option<&Failure>) -> R
 /// A request with a request id, so that it can be made again where the answer is lost.
 pub(super) fn create_request(
     parent: String,
-    input: JobInput,
+    source: Source,
     settings: &SolveSettings,
     options: JobOptions,
 ) -> proto::CreateJobRequest {
@@ -344,7 +363,7 @@ pub(super) fn create_request(
             webhook: options.webhook_url.map(|url| proto::Webhook { url, ..proto::Webhook::default() }),
             ..proto::Job::default()
         }),
-        source: Some(input),
+        source: Some(source),
     }
 }
 

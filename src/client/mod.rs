@@ -52,7 +52,7 @@ use tonic::transport::{Channel, Endpoint};
 use tonic::{Response, Status};
 
 pub use error::{Error, ErrorKind};
-pub use input_data::InputData;
+pub use input_data::{InputData, JobInput};
 pub use jobs::{JobOptions, Page, ended, ended_as};
 pub use options::{ApiKey, OWN_TENANT, Options, Setting};
 pub use upload::EncodedInput;

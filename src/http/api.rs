@@ -121,6 +121,13 @@ impl Api {
             }
             return Ok(grpc_web::answer(&self.gateway, connection_info, request).await);
         }
+        if let Some(encoding) =
+            request.headers().get(header::CONTENT_ENCODING).filter(|encoding| *encoding != "identity")
+        {
+            let refused = answer::refuse(HttpRefusal::MediaType, format!("the body is encoded ({encoding:?})"));
+            // RFC 9110, section 15.5.16.
+            return Err(Box::new(([(header::ACCEPT_ENCODING, "identity")], *refused).into_response()));
+        }
         let verb = if request.method() == Method::HEAD { Method::GET } else { request.method().clone() };
         let mut allowed = Vec::new();
         if path == OPENAPI_PATH && self.gateway.describes {

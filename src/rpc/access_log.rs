@@ -69,7 +69,7 @@ fn trace_id(trace_parent: &str) -> Option<String> {
 }
 
 /// Codes of calls that are refused for what the caller is or does, not for what the call asks.
-const REFUSALS: [Code; 3] = [Code::Unauthenticated, Code::PermissionDenied, Code::ResourceExhausted];
+const REFUSALS: [Code; 4] = [Code::Unauthenticated, Code::PermissionDenied, Code::ResourceExhausted, Code::OutOfRange];
 
 /// Writes refusals down, those of each code apart: callers without a key hide none of a full queue.
 #[derive(Debug, Clone, Default)]

@@ -4,8 +4,8 @@ use std::sync::Arc;
 use std::sync::atomic::Ordering;
 use std::time::Duration;
 
-use scpsfm::client::{Client, EncodedInput, Error, ErrorKind, JobOptions, Options, Setting, ended};
-use scpsfm::domain::job::{EventBody, JobEvent, JobState};
+use scpsfm::client::{Client, EncodedInput, Error, ErrorKind, JobInput, JobOptions, Options, Setting, ended};
+use scpsfm::domain::job::{EventBody, Job, JobEvent, JobState};
 use scpsfm::domain::{Input, Limits, Method, Silent, Solution, SolveSettings, StopToken, Warning, WarningCode};
 use scpsfm::engine::{Solver, default_solver};
 use scpsfm::rpc::proto::job_service_client::JobServiceClient;
@@ -38,7 +38,7 @@ async fn an_uploaded_input_is_solved_as_it_is_in_process() {
     let mut client = server.client().await;
 
     let uploaded = client.upload(&EncodedInput::new(&scene.input), &mut |_| ()).await.expect("uploaded");
-    let job = client.create_with(&uploaded, &settings, JobOptions::default()).await.expect("a job");
+    let job = client.create(JobInput::Uploaded(uploaded), &settings, JobOptions::default()).await.expect("a job");
     let mut states = Vec::new();
     let mut on_event = |event: &JobEvent| {
         if let EventBody::State { state, .. } = event.body {
@@ -124,6 +124,34 @@ async fn a_watch_goes_on_over_a_restart_without_gap_or_repeat() {
     ended(&last.expect("watched to the end").expect("an event")).expect("solved after the restart");
     assert_eq!(sequences, (1..=sequences.len() as u64).collect::<Vec<_>>());
     drop(server);
+}
+
+#[tokio::test]
+async fn inputs_that_are_too_large_for_a_message_are_uploaded() {
+    // The least that a configuration may say.
+    let options = server::Options { max_message_bytes: 1_049_600, ..server::Options::default() };
+    let server = TestServer::start_with(quick(), options, one_worker()).await;
+    let mut client = server.client().await;
+    let large = raw(2, 40_000);
+    let job = client.create(&large, &settings(), JobOptions::default()).await.expect("a job");
+    ended(&soon(client.watch(&job.name, 0, &mut |_| ())).await.expect("watched").expect("an event")).expect("solved");
+
+    // Each fits into a message, all of them do not.
+    let medium = || JobInput::from(raw(2, 10_000));
+    let options = JobOptions { request_id: Some("r".into()), ..JobOptions::default() };
+    let jobs = client.create_batch([medium(), medium(), medium(), large.clone().into()], &settings(), &options).await;
+    let jobs = jobs.expect("four jobs");
+    let names = |jobs: &[Job]| jobs.iter().map(|job| job.name.clone()).collect::<Vec<_>>();
+    assert_eq!(jobs.len(), 4);
+    let again = client.create_batch([medium(), medium(), medium(), large.clone().into()], &settings(), &options).await;
+    assert_eq!(names(&again.expect("the same")), names(&jobs));
+
+    let mut bad = large;
+    bad.x[7] = f64::NAN;
+    let refused = client.create_batch([medium(), bad.into()], &settings(), &JobOptions::default()).await;
+    let refused = refused.expect_err("NaN");
+    let first = &refused.violations[0];
+    assert_eq!((first.field.as_str(), first.index), ("requests[1].track_set.xs", Some(7)), "{refused:?}");
 }
 
 #[tokio::test]
