@@ -53,18 +53,14 @@ impl<const C: usize, const P: usize> Panel<C, P> {
         self.values.resize(first + self.rows * P, 0.0);
         for ((seen, jacobian), whitened) in observations.iter().zip(jacobians).zip(whitened) {
             let [u, v] = &jacobian.camera.data.0;
-            let mut k = 0;
-            while k < P {
+            for k in 0..P {
                 let (x, y) = (whitened[(k, 0)], whitened[(k, 1)]);
                 let start = first + k * self.rows + C * seen.view;
                 if let Some(slots) = self.values[start..].first_chunk_mut::<C>() {
-                    let mut r = 0;
-                    while r < C {
-                        slots[r] += u[r] * x + v[r] * y;
-                        r += 1;
+                    for ((slot, u), v) in slots.iter_mut().zip(u).zip(v) {
+                        *slot += u * x + v * y;
                     }
                 }
-                k += 1;
             }
         }
     }

@@ -249,21 +249,15 @@ impl<const C: usize, const P: usize> Reduced<C, P> {
     ) {
         let (row, column) = (C * row, C * column);
         let ([first, second], [u, v]) = (&left.data.0, &right.data.0);
-        // Loops by hand over arrays: this is the innermost loop of every search, and iterators cost four times as
-        // much in builds for tests, which barely optimise.
-        let mut k = 0;
-        while k < C {
-            let x = through.m11 * u[k] + through.m12 * v[k];
-            let y = through.m21 * u[k] + through.m22 * v[k];
+        for (k, (u, v)) in u.iter().zip(v).enumerate() {
+            let x = through.m11 * u + through.m12 * v;
+            let y = through.m21 * u + through.m22 * v;
             let start = (column + k) * self.dimension + row;
             if let Some(slots) = self.matrix[start..].first_chunk_mut::<C>() {
-                let mut r = 0;
-                while r < C {
-                    slots[r] += first[r] * x + second[r] * y;
-                    r += 1;
+                for ((slot, first), second) in slots.iter_mut().zip(first).zip(second) {
+                    *slot += first * x + second * y;
                 }
             }
-            k += 1;
         }
     }
 

@@ -191,8 +191,7 @@ impl<const N: usize> SideBySide<N> {
             let of_direction = a[2] * a[2] + b[2] * b[2] + c[2] * c[2];
             let of_all = of_direction + d[2] * d[2];
             let weight = seen.weight / (of_direction + of_all * f64::EPSILON).map(|sum| sum.max(f64::MIN_POSITIVE));
-            let mut axis = 0;
-            while axis < 2 {
+            for axis in [0, 1] {
                 let coordinate = seen.xy[axis];
                 let row = [
                     a[2] * coordinate - a[axis],
@@ -201,7 +200,6 @@ impl<const N: usize> SideBySide<N> {
                     d[2] * coordinate - d[axis],
                 ];
                 normal.add_square(weight, row);
-                axis += 1;
             }
         }
         normal.hold_unseen();
@@ -224,8 +222,7 @@ impl<const N: usize> SideBySide<N> {
                 let image = seen.image(&points);
                 let nearness = away_from_zero(image[2]).recip();
                 let [a, b, c, d] = &seen.camera;
-                let mut axis = 0;
-                while axis < 2 {
+                for axis in [0, 1] {
                     let projected = image[axis] * nearness;
                     let slope = [
                         (a[axis] - projected * a[2]) * nearness,
@@ -239,7 +236,6 @@ impl<const N: usize> SideBySide<N> {
                     gradient[1] += slope[1] * pull;
                     gradient[2] += slope[2] * pull;
                     gradient[3] += slope[3] * pull;
-                    axis += 1;
                 }
             }
             // The scale of the homogeneous point is free: pin it.

@@ -3,6 +3,7 @@
 //!
 //! Everything is inlined into its caller, which [`vectorised`](crate::simd::vectorised) compiles.
 
+use std::array::from_fn;
 use std::ops::{Add, AddAssign, Div, Mul, MulAssign, Sub};
 
 /// What is added to the diagonal for a null vector, as a share of the trace: it moves no eigenvector, and makes the
@@ -29,47 +30,23 @@ impl<const N: usize> F64xN<N> {
 
     #[inline(always)]
     pub fn map(self, f: impl Fn(f64) -> f64) -> Self {
-        let mut mapped = self;
-        let mut lane = 0;
-        while lane < N {
-            mapped.0[lane] = f(self.0[lane]);
-            lane += 1;
-        }
-        mapped
+        Self(self.0.map(f))
     }
 
     #[inline(always)]
     fn zip(self, other: Self, f: impl Fn(f64, f64) -> f64) -> Self {
-        let mut zipped = self;
-        let mut lane = 0;
-        while lane < N {
-            zipped.0[lane] = f(self.0[lane], other.0[lane]);
-            lane += 1;
-        }
-        zipped
+        Self(from_fn(|lane| f(self.0[lane], other.0[lane])))
     }
 
     #[inline(always)]
     pub fn compare(self, other: Self, f: impl Fn(f64, f64) -> bool) -> Mask<N> {
-        let mut mask = [false; N];
-        let mut lane = 0;
-        while lane < N {
-            mask[lane] = f(self.0[lane], other.0[lane]);
-            lane += 1;
-        }
-        mask
+        from_fn(|lane| f(self.0[lane], other.0[lane]))
     }
 
     /// This where the mask holds, the other elsewhere.
     #[inline(always)]
     pub fn or(self, mask: Mask<N>, other: Self) -> Self {
-        let mut chosen = self;
-        let mut lane = 0;
-        while lane < N {
-            chosen.0[lane] = if mask[lane] { self.0[lane] } else { other.0[lane] };
-            lane += 1;
-        }
-        chosen
+        Self(from_fn(|lane| if mask[lane] { self.0[lane] } else { other.0[lane] }))
     }
 
     #[inline(always)]
@@ -251,13 +228,7 @@ impl<const N: usize> Symmetric<N> {
 
     #[inline(always)]
     fn scaled(&self, factor: F64xN<N>) -> Self {
-        let mut scaled = *self;
-        let mut k = 0;
-        while k < 10 {
-            scaled.0[k] *= factor;
-            k += 1;
-        }
-        scaled
+        Self(self.0.map(|entry| entry * factor))
     }
 
     /// Cholesky's factor (Golub & Van Loan, section 4.2); not a number where the matrix is not positive definite.

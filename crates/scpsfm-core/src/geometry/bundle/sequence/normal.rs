@@ -399,22 +399,15 @@ fn add_to_view(values: &mut [f64], place: Place, unknowns: usize, rows: &[[f64; 
     }
 }
 
-/// Loops by hand over arrays, here and below: iterators cost several times as much in builds for tests, which barely
-/// optimise.
 #[inline(always)]
 fn add_rows<const R: usize>(values: &mut [f64], place: Place, rows: &[[f64; VIEW]; 2], [a, b]: [&[f64]; 2]) {
     let [first, second] = rows;
-    let b = &b[..a.len()];
-    let mut k = 0;
-    while k < a.len() {
+    for (k, (a, b)) in a.iter().zip(b).enumerate() {
         if let Some(slots) = values[place.start + k * place.stride..].first_chunk_mut::<R>() {
-            let mut r = 0;
-            while r < R {
-                slots[r] += first[r] * a[k] + second[r] * b[k];
-                r += 1;
+            for ((slot, first), second) in slots.iter_mut().zip(first).zip(second) {
+                *slot += first * a + second * b;
             }
         }
-        k += 1;
     }
 }
 

@@ -82,12 +82,10 @@ impl PointFactor {
         let (a, rest) = whitened.split_at_mut(stride);
         let (b, c) = rest.split_at_mut(stride);
         let (a, b, c) = (&mut a[..rows], &mut b[..rows], &mut c[..rows]);
-        let mut k = 0;
-        while k < rows {
+        for k in 0..rows {
             a[k] = coupling[k] * l00;
             b[k] = (coupling[rows + k] - l10 * a[k]) * l11;
             c[k] = (coupling[2 * rows + k] - l20 * a[k] - l21 * b[k]) * l22;
-            k += 1;
         }
     }
 }

@@ -304,33 +304,20 @@ pub(super) fn substitute(
 
 #[inline(always)]
 fn dot(a: &[f64], b: &[f64]) -> f64 {
-    let b = &b[..a.len()];
-    let (mut sum, mut k) = (0.0, 0);
-    while k < a.len() {
-        sum += a[k] * b[k];
-        k += 1;
-    }
-    sum
+    a.iter().zip(b).map(|(a, b)| a * b).sum()
 }
 
 /// Subtracts `left right'` from a block of six rows; both factors have three columns.
-///
-/// Loops by hand over arrays, here and below: this is the innermost loop, and iterators cost several times as much in
-/// builds for tests, which barely optimise.
 #[inline(always)]
 fn subtract_from_pose(values: &mut [f64], stride: usize, left: &[f64; POINT * POSE], right: &[f64]) {
     let columns = right.len() / POINT;
-    let mut k = 0;
-    while k < columns {
+    for k in 0..columns {
         let (a, b, c) = (right[k], right[columns + k], right[2 * columns + k]);
         if let Some(slots) = values[k * stride..].first_chunk_mut::<POSE>() {
-            let mut r = 0;
-            while r < POSE {
-                slots[r] -= left[r] * a + left[POSE + r] * b + left[2 * POSE + r] * c;
-                r += 1;
+            for (r, slot) in slots.iter_mut().enumerate() {
+                *slot -= left[r] * a + left[POSE + r] * b + left[2 * POSE + r] * c;
             }
         }
-        k += 1;
     }
 }
 
@@ -338,15 +325,10 @@ fn subtract_from_pose(values: &mut [f64], stride: usize, left: &[f64; POINT * PO
 #[inline(always)]
 fn subtract_product(values: &mut [f64], stride: usize, left: &[f64], right: &[f64]) {
     let (rows, columns) = (left.len() / POINT, right.len() / POINT);
-    let mut k = 0;
-    while k < columns {
+    for k in 0..columns {
         let (a, b, c) = (right[k], right[columns + k], right[2 * columns + k]);
-        let slots = &mut values[k * stride..][..rows];
-        let mut r = 0;
-        while r < rows {
-            slots[r] -= left[r] * a + left[rows + r] * b + left[2 * rows + r] * c;
-            r += 1;
+        for (r, slot) in values[k * stride..][..rows].iter_mut().enumerate() {
+            *slot -= left[r] * a + left[rows + r] * b + left[2 * rows + r] * c;
         }
-        k += 1;
     }
 }
