@@ -85,7 +85,7 @@ impl Study {
             Some(track_scores) => {
                 (track_scores.truncations(), affine::seed(&self.block, track_scores.start()).into_iter().collect())
             }
-            None => (self.search.even_truncations(), Vec::new()),
+            None => (vec![1.0; self.block.tracks()], Vec::new()),
         };
         let mut shortlist = Shortlist::new(SHORTLIST);
         let mut rng = ChaCha8Rng::seed_from_u64(seed);

@@ -5,12 +5,10 @@
 
 use super::block::Block;
 use super::consensus::{self, Consensus, ConsensusOptions};
-use super::grow;
+use super::grow::{self, Fits};
 use super::problem::Problem;
 use super::view_selection::evenly;
 use super::{near_duplicates, static_tracks};
-use crate::geometry::Point;
-use crate::geometry::bundle::{self, projective};
 
 options! {
     /// How what the search left aside is judged.
@@ -48,8 +46,8 @@ pub fn extend(problem: &Problem, searched: &Block, consensus: &Consensus) -> Opt
     if all.tracks.len() == searched.tracks.len() {
         return None;
     }
-    let judge = |cameras, noise| consensus::judge(&all.complete, cameras, noise, problem.stop);
-    let mut found = judge(consensus.cameras.clone(), OPTIONS.widenings[0] * consensus.noise);
+    let judged_at = OPTIONS.widenings[0] * consensus.noise;
+    let mut found = consensus::judge(&all.complete, consensus.cameras.clone(), judged_at, problem.stop);
     let mut before = Vec::new();
     for round in 1..=OPTIONS.most_rounds {
         let inliers = found.inliers();
@@ -61,16 +59,10 @@ pub fn extend(problem: &Problem, searched: &Block, consensus: &Consensus) -> Opt
         }
         let noise = grow::estimate_noise(&found, &inliers);
         let support = evenly(&inliers, OPTIONS.most_inliers);
-        let mut cameras = found.cameras.clone();
-        let mut points: Vec<Point> = support.iter().map(|&track| found.points[track]).collect();
-        let observations = consensus::observations_of(&all.complete, &support);
-        let options = bundle::Options {
-            max_iterations: OPTIONS.iterations,
-            loss: ConsensusOptions::DEFAULT.loss(noise),
-            ..Default::default()
-        };
-        projective::adjust(&mut cameras, &mut points, &observations, &options, problem.stop);
-        found = judge(cameras, OPTIONS.widenings.get(round).copied().unwrap_or(1.0) * noise);
+        let judged_at = OPTIONS.widenings.get(round).copied().unwrap_or(1.0) * noise;
+        let loss = ConsensusOptions::DEFAULT.loss(noise);
+        let mut fits = Fits::new(&all.complete, judged_at, problem.stop);
+        found = fits.refit(&found, &support, loss, OPTIONS.iterations);
         before = inliers;
     }
     let inliers = consensus.inliers();

@@ -31,9 +31,6 @@ use crate::geometry::{Camera, Point};
 const LEAST_OBSERVATIONS: usize = 2;
 
 /// The solution that the best of what was found gives; without any, the reason.
-///
-/// # Errors
-/// [`Error::Stopped`]; [`Error::Internal`] for defects.
 pub fn solution(ended: Ended, problem: &Problem, mut recorder: Recorder) -> Result<Solution, Error> {
     let mut warnings = problem.warnings.clone();
     let mut first = match Assembled::of(ended, problem, &mut recorder) {

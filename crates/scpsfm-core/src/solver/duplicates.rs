@@ -9,9 +9,6 @@ use crate::domain::result::ObservationResults;
 use crate::domain::{Input, Observer, Progress, Solution, Stage};
 
 /// Solves the input without its duplicates, by `solve`, and answers for all of it.
-///
-/// # Errors
-/// Those of `solve`.
 pub fn solve_once(
     input: &Input,
     duplicates: &Duplicates,

@@ -58,12 +58,6 @@ pub fn evidence(observations: usize, unknowns: usize, noise: f64, outlier_densit
     -constraints * (outlier_density * noise * (std::f64::consts::TAU * std::f64::consts::E).sqrt()).ln()
 }
 
-/// Squared residual within which an observation is more likely right than wrong while nothing is known of the noise's
-/// tail.
-pub fn working_gate(noise: f64, outlier_density: f64) -> f64 {
-    NoiseModel::new(noise, outlier_density).gate()
-}
-
 /// How the residuals of right observations are distributed.
 ///
 /// A core of Gaussian noise and a tail of three times that width, beside wrong observations that may be anywhere.

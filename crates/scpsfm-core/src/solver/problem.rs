@@ -10,8 +10,9 @@ use super::calibration::CalibrationOptions;
 use super::consensus::{LEAST_INLIERS, LEAST_VIEWS, NoiseOptions};
 use super::error::Error;
 use super::known_focal::{KnownFocal, known_focal};
+use super::noise_model::{self, NoiseModel};
 use super::normalization::normalization;
-use super::{near_duplicates, noise_model, static_tracks};
+use super::{near_duplicates, static_tracks};
 use crate::domain::{FocalPrior, Input, Method, SolveSettings, StopToken, VERIFIED, View, Warning, WarningCode};
 use crate::geometry::bundle::metric::Intrinsics;
 use crate::geometry::measurement::Normalization;
@@ -226,9 +227,10 @@ impl<'a> Problem<'a> {
         (views.iter().map(place).collect(), cameras)
     }
 
-    /// Squared residual, normalised units, within which an observation agrees with its point at this noise.
+    /// Squared residual, normalised units, within which an observation agrees with its point at this noise, of whose
+    /// tail nothing is known.
     pub fn gate(&self, noise: f64) -> f64 {
-        noise_model::working_gate(noise, self.outlier_density)
+        NoiseModel::new(noise, self.outlier_density).gate()
     }
 
     /// The tracks that are complete over these views.

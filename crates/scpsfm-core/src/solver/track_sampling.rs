@@ -16,9 +16,6 @@ const ASKED_OBSERVATIONS: usize = 50_000;
 /// A sample of at most `most` tracks of a block, and what the network says of it, where it was asked.
 ///
 /// * `asks_network`: whether the network may be asked
-///
-/// # Errors
-/// [`Error::Stopped`].
 pub fn sample(
     problem: &Problem,
     block: &Block,

@@ -1,17 +1,15 @@
 //! The methods without search (PAPER, SCPSFM and PSFM) on the densest blocks of views.
 
-use super::{Attempt, Effort, solve_block};
+use super::{Attempt, solve_block};
 use crate::solver::error::Error;
 use crate::solver::fusion::{self, Estimate};
+use crate::solver::portfolio::Effort;
 use crate::solver::problem::Problem;
 use crate::solver::recorder::Recorder;
 use crate::solver::view_selection;
 
 /// Solves the densest blocks of views, one at least and until one is METRIC; the best of them. Blocks that disagree
 /// raise its uncertainty; other views are left out.
-///
-/// # Errors
-/// [`Error::Stopped`]; [`Error::Internal`] for defects.
 pub fn solve_densest(problem: &Problem, recorder: &mut Recorder) -> Result<Option<Attempt>, Error> {
     let candidates = view_selection::candidate_views(problem);
     let mut attempts: Vec<Attempt> = Vec::new();

@@ -17,7 +17,7 @@ use super::error::Error;
 use super::fusion::Estimate;
 use super::grow;
 use super::learned::TrackScores;
-use super::portfolio::{Found, Portfolio, VerifiedBy};
+use super::portfolio::{Effort, Found, Portfolio, VerifiedBy};
 use super::problem::Problem;
 use super::projective::ProjectiveReconstruction;
 use super::recorder::Recorder;
@@ -40,15 +40,6 @@ const CRITICAL: [WarningCode; 5] = [
 
 /// Merit of a WEAK attempt, see [`Attempt::merit`].
 pub const WEAK_MERIT: u8 = 3;
-
-/// How much of a search is worth its time.
-#[derive(Debug, Clone, Copy, Default)]
-pub struct Effort {
-    /// The block is the seed of more: as much of it is solved as carries a calibration, and no more.
-    pub is_seed: bool,
-    /// Only what is cheap is searched.
-    pub is_quick: bool,
-}
 
 /// What became of one block.
 pub struct Attempt {
@@ -230,9 +221,6 @@ fn are_mixed(mut squared: Vec<f64>) -> bool {
 ///
 /// * `priors`: what is known of the focal length of each camera instead of what its views bring: what another part of the
 ///   input said; nothing of a camera beyond the slice
-///
-/// # Errors
-/// [`Error::Stopped`]; [`Error::Internal`] for defects.
 pub fn solve_block(
     problem: &Problem,
     block: Block,
@@ -246,9 +234,6 @@ pub fn solve_block(
 }
 
 /// Searches a block, or as many of its tracks as its method can afford, for a consensus.
-///
-/// # Errors
-/// As [`solve_block`].
 pub fn search_block(
     problem: &Problem,
     block: Block,
@@ -277,9 +262,6 @@ pub fn search_block(
 }
 
 /// Calibrates what stands of an attempt.
-///
-/// # Errors
-/// As [`solve_block`].
 pub fn calibrate(
     problem: &Problem,
     attempt: &mut Attempt,
@@ -332,12 +314,10 @@ fn search(
 ) -> Result<Attempt, Error> {
     let mut attempt = Attempt::new(block);
     let (complete, tracks) = (&attempt.block.complete, &attempt.block.tracks);
-    attempt.found = Portfolio::new(complete, problem.settings, problem.initial_noise, problem.stop)
-        .geometry_first(effort.is_seed)
-        .quickly(effort.is_quick)
-        .with_track_scores(track_scores)
-        .run(recorder, &|weights| problem.scatter(weights, tracks))
-        .map_err(|error| Error::Internal(error.to_string()))?;
+    attempt.found =
+        Portfolio::new(complete, problem.settings, problem.initial_noise, effort, track_scores, problem.stop)
+            .run(recorder, &|weights| problem.scatter(weights, tracks))
+            .map_err(|error| Error::Internal(error.to_string()))?;
     problem.stopped()?;
     let Some(consensus) = attempt.found.consensus.take() else { return Ok(attempt) };
     recorder.enter(Stage::Refine);

@@ -238,9 +238,6 @@ pub struct Stretch<'a> {
 /// * `problem`: the projective cameras and points of `metric`
 /// * `stretch`: the views on which it is compared with projective cameras, of the same camera groups; `None`: all
 /// * `heartbeat`: called after each of its steps, of which a large problem takes some tenths of a second
-///
-/// # Errors
-/// As [`calibrate`].
 pub fn from_metric(
     problem: &Uncalibrated,
     metric: &MetricReconstruction,

@@ -26,7 +26,7 @@ const CONSENSUS: ConsensusOptions = ConsensusOptions::DEFAULT;
 ///
 /// Growing and polishing come back to a support that stands still several times each: with 100 right tracks in 11
 /// views, 37 adjustments become 11.
-struct Fits<'a> {
+pub struct Fits<'a> {
     block: &'a CompleteBlock,
     noise: f64,
     stop: &'a StopToken,
@@ -73,7 +73,7 @@ impl<'a> Fits<'a> {
     }
 
     /// The same from where a consensus stands.
-    fn refit(&mut self, from: &Consensus, support: &[usize], loss: Loss, iterations: usize) -> Consensus {
+    pub fn refit(&mut self, from: &Consensus, support: &[usize], loss: Loss, iterations: usize) -> Consensus {
         let points = support.iter().map(|&track| from.points[track]).collect();
         self.fit(&from.cameras, points, support, loss, iterations).0
     }

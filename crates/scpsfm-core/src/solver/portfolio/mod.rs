@@ -60,6 +60,16 @@ enum Search {
     Subspace(subspace::SubspaceSearch),
 }
 
+/// How much of a search is worth its time.
+#[derive(Debug, Clone, Copy, Default)]
+pub struct Effort {
+    /// The block is the seed of more: as much of it is solved as carries a calibration, and no more. Its own statistics
+    /// go first, whatever the trained network says: to hear that first was measured to cost a seed a hundredth of F1.
+    pub is_seed: bool,
+    /// The search ends after [`PortfolioOptions::quick_rounds`], without the paper's network.
+    pub is_quick: bool,
+}
+
 /// Searches one block.
 pub struct Portfolio<'a> {
     block: &'a CompleteBlock,
@@ -79,15 +89,20 @@ pub struct Portfolio<'a> {
     near_duplicate_count: usize,
     rigid: Option<(Proposal, Rigid)>,
     track_scores: Option<TrackScores>,
-    /// The scene's own statistics go first, whatever the trained network says.
-    geometry_first: bool,
-    /// Only what is cheap is tried.
-    is_quick: bool,
+    effort: Effort,
 }
 
 impl<'a> Portfolio<'a> {
     /// * `noise`: noise that growing starts from, normalised units; rather too high than too low
-    pub fn new(block: &'a CompleteBlock, settings: &'a SolveSettings, noise: f64, stop: &'a StopToken) -> Self {
+    /// * `track_scores`: what the trained network says of the block, where it was asked already
+    pub fn new(
+        block: &'a CompleteBlock,
+        settings: &'a SolveSettings,
+        noise: f64,
+        effort: Effort,
+        track_scores: Option<TrackScores>,
+        stop: &'a StopToken,
+    ) -> Self {
         let search = if block.has_depths() {
             Search::Subspace(subspace::SubspaceSearch::new(block, noise, settings.use_daq))
         } else {
@@ -107,26 +122,9 @@ impl<'a> Portfolio<'a> {
             near_duplicates: None,
             near_duplicate_count: 0,
             rigid: None,
-            track_scores: None,
-            geometry_first: false,
-            is_quick: false,
+            track_scores,
+            effort,
         }
-    }
-
-    /// Whether the scene's own statistics go first, whatever the trained network says: in the windows that seed a
-    /// sequence, where it was measured to cost a seed a hundredth of F1 to hear the network first.
-    pub fn geometry_first(self, geometry_first: bool) -> Self {
-        Self { geometry_first, ..self }
-    }
-
-    /// Whether the search ends after [`PortfolioOptions::quick_rounds`], without the paper's network.
-    pub fn quickly(self, is_quick: bool) -> Self {
-        Self { is_quick, ..self }
-    }
-
-    /// What the trained network says of the block, where it was asked already.
-    pub fn with_track_scores(self, track_scores: Option<TrackScores>) -> Self {
-        Self { track_scores, ..self }
     }
 
     /// Runs the search; `spread_weights` maps the block's weights to the caller's tracks.
@@ -140,7 +138,7 @@ impl<'a> Portfolio<'a> {
         recorder: &mut Recorder,
         spread_weights: &dyn Fn(&[f64]) -> Vec<f32>,
     ) -> Result<Found, crate::network::Error> {
-        let rounds = if self.is_quick { OPTIONS.quick_rounds } else { OPTIONS.rounds };
+        let rounds = if self.effort.is_quick { OPTIONS.quick_rounds } else { OPTIONS.rounds };
         let mut heads = None;
         let mut head_round = 0;
         self.ask(recorder, spread_weights);
@@ -171,7 +169,7 @@ impl<'a> Portfolio<'a> {
 
     /// Whether heads of the network may be optimised.
     fn may_optimise(&self) -> bool {
-        self.settings.method.uses_network() && !self.is_quick && self.is_wanted(Proposal::Network)
+        self.settings.method.uses_network() && !self.effort.is_quick && self.is_wanted(Proposal::Network)
     }
 
     fn head_search(&self) -> HeadSearch {

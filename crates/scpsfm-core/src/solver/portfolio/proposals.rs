@@ -82,7 +82,7 @@ impl<'a> Portfolio<'a> {
     /// Of mostly right tracks the statistics of the scene itself rank better than what was learned from others: on real
     /// photographs they put nearly every right track first. Where few are right they rank worse the fewer there are.
     pub(super) fn propose_at_once(&mut self, round: u32) {
-        let many = self.geometry_first || self.track_scores.as_ref().is_none_or(TrackScores::expects_many);
+        let many = self.effort.is_seed || self.track_scores.as_ref().is_none_or(TrackScores::expects_many);
         if many && round == 0 {
             self.propose_geometric();
         }
@@ -153,7 +153,7 @@ impl<'a> Portfolio<'a> {
             Search::Affine(search) => {
                 let mut shortlist = Shortlist::new(OPTIONS.shortlist);
                 let drawn = samples(OPTIONS.affine_samples);
-                let even = search.even_truncations();
+                let even = vec![1.0; self.block.tracks()];
                 let truncations = truncations.unwrap_or(&even);
                 search.run(&sampler, truncations, drawn, &mut self.rng, &mut shortlist, self.stop);
                 let seeds = shortlist.into_entries();

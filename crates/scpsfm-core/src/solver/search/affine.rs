@@ -38,16 +38,11 @@ impl AffineSearch {
         &self.centred
     }
 
-    /// What every hypothesis pays for a track that it leaves out, where no prior says anything else.
-    pub fn even_truncations(&self) -> Vec<f64> {
-        vec![1.0; self.centred.ncols()]
-    }
-
     /// Draws `samples` samples and offers them to the shortlist.
     ///
     /// * `truncations`: what a hypothesis pays for each track that it leaves out, in units of the cost of a residual of
-    ///   [`AffineOptions::tolerance`]; more for tracks that a prior believes in (the logarithm of the posterior, up to
-    ///   a constant)
+    ///   [`AffineOptions::tolerance`]: 1, or more for tracks that a prior believes in (the logarithm of the posterior,
+    ///   up to a constant)
     pub fn run(
         &self,
         sampler: &Sampler,

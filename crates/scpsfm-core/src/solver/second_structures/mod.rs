@@ -89,9 +89,6 @@ pub struct Structure {
 
 impl Structure {
     /// That of these tracks, in the views of another reconstruction.
-    ///
-    /// # Errors
-    /// [`Error::Stopped`]; [`Error::Internal`] for defects.
     pub fn of_tracks(problem: &Problem, geometry: &Geometry, tracks: Vec<bool>) -> Result<Self, Error> {
         let reconstruction = reconstructed(problem, geometry, &tracks, 0, |_| true)?.map(|(found, _)| found);
         Ok(Self { tracks, reconstruction })
@@ -108,9 +105,6 @@ impl Structure {
 ///
 /// * `evidence`: that of the reconstruction
 /// * `known`: tracks that are not searched
-///
-/// # Errors
-/// [`Error::Stopped`]; [`Error::Internal`] for defects.
 pub fn find(
     problem: &Problem,
     geometry: &Geometry,
@@ -150,9 +144,6 @@ pub fn find(
 ///
 /// Tracks, not observations: a camera that walks round a body sees it all the time, and each point of the scene for a
 /// while.
-///
-/// # Errors
-/// As [`find`].
 pub fn rival(
     problem: &Problem,
     geometry: &Geometry,

@@ -29,9 +29,6 @@ const LEAST_OBSERVATIONS: usize = 2;
 
 /// What is said of a structure: nothing of its motion without a metric reconstruction of the scene, nor where its
 /// tracks make none under the calibration of that.
-///
-/// # Errors
-/// [`Error::Stopped`].
 pub fn describe(
     problem: &Problem,
     reconstruction: &Reconstruction,

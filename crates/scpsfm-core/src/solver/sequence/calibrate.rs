@@ -21,9 +21,6 @@ const OPTIONS: StretchOptions = StretchOptions::DEFAULT;
 /// length by more than its sigma, and not so far that the calibration is refused, everything is calibrated a second
 /// time, from what fits behind the adjusted lens. The second calibration is used unless it grades a camera worse, or
 /// the views no longer hold together.
-///
-/// # Errors
-/// [`Error::Stopped`].
 pub fn calibrate(problem: &Problem, model: &mut Model, recorder: &mut Recorder) -> Result<Vec<Outcome>, Error> {
     if problem.has_own_focals() {
         return own_focals::calibrate(problem, model, recorder).map(|outcome| vec![outcome]);

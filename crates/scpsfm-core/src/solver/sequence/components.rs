@@ -8,10 +8,11 @@ use super::triplets::Pairs;
 use super::{merging, register, structure};
 use crate::domain::{FocalPrior, Grade};
 use crate::geometry::bundle::metric::Intrinsics;
-use crate::solver::attempt::{self, Attempt, Effort};
+use crate::solver::attempt::{self, Attempt};
 use crate::solver::calibration::Outcome;
 use crate::solver::consensus;
 use crate::solver::error::Error;
+use crate::solver::portfolio::Effort;
 use crate::solver::problem::Problem;
 use crate::solver::recorder::Recorder;
 use crate::solver::view_selection::{self, SeedViews};
@@ -38,9 +39,6 @@ pub fn first(problem: &Problem, seed: &Attempt, recorder: &mut Recorder) -> Mode
 
 /// Solves and extends what may be a component, one after the other, as long as there is any among the views that are
 /// left: blocks of one camera, then of several together, then triplets.
-///
-/// # Errors
-/// [`Error::Stopped`]; [`Error::Internal`] for defects.
 pub fn others(
     problem: &Problem,
     model: &mut Model,
@@ -115,9 +113,6 @@ fn add(
 
 /// Joins the views that are left by fewer points, see [`GrowthOptions::LAST`], moves those that another component holds
 /// better, and merges components that share enough.
-///
-/// # Errors
-/// [`Error::Stopped`].
 pub fn join_rest(
     problem: &Problem,
     model: &mut Model,

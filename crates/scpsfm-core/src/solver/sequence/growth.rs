@@ -42,9 +42,6 @@ pub struct Trial {
 /// Adds every view that can be registered, those that see most of the points first.
 ///
 /// * `trials`: one a view
-///
-/// # Errors
-/// [`Error::Stopped`].
 pub fn grow(
     problem: &Problem,
     growth: &mut impl Growth,

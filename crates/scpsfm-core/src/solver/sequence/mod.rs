@@ -50,9 +50,6 @@ use quick_pass::QuickPass;
 /// Solves an input. Where pinholes give no calibration of most views, solves it once more with the lenses undone that
 /// explain seeds better, before anything else is tried of pinholes, and where that calibrates a part, with the lenses
 /// undone that were calibrated; what is undone stays so in the problem where that answer stands.
-///
-/// # Errors
-/// [`Error::Stopped`]; [`Error::Internal`] for defects.
 pub fn solve(problem: &mut Problem, recorder: &mut Recorder) -> Result<Ended, Error> {
     let quick = QuickPass::new(problem, recorder)?;
     let mut behind = None;

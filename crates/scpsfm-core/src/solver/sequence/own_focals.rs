@@ -20,9 +20,6 @@ use crate::solver::recorder::Recorder;
 const CAMERA: usize = 0;
 
 /// Calibrates run after run, takes the model over, adjusts everything under it and asks the windows.
-///
-/// # Errors
-/// [`Error::Stopped`].
 pub fn calibrate(problem: &Problem, model: &mut Model, recorder: &mut Recorder) -> Result<Outcome, Error> {
     let registered = model.registered();
     let runs = runs(model);

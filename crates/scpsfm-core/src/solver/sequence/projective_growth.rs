@@ -41,9 +41,6 @@ struct Growing<'a> {
 }
 
 /// Grows a reconstruction to every view that can be registered, and every track that points are found for.
-///
-/// # Errors
-/// [`Error::Stopped`].
 pub fn extend(
     problem: &Problem,
     start: ProjectiveReconstruction,

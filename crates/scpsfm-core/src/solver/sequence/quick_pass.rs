@@ -42,9 +42,6 @@ impl QuickPass {
     /// that is not METRIC and holds less than half of the views, triplets in the same way. Only where none of these
     /// stands: the blocks again, with everything that a search can try, and the subsets that are left. An input whose
     /// tracks are mostly complete is its only block; with depths it is searched at length at once.
-    ///
-    /// # Errors
-    /// [`Error::Stopped`]; [`Error::Internal`] for defects.
     pub fn finish(self, problem: &Problem, recorder: &mut Recorder) -> Result<Ended, Error> {
         let Self { blocks, result } = self;
         let is_quick = blocks.begin_quickly(problem);
@@ -80,9 +77,6 @@ impl QuickPass {
 ///
 /// * `is_promising`: which blocks, without near-duplicates, are worth a search
 /// * `most_triplets`: how many triplets are searched
-///
-/// # Errors
-/// As [`QuickPass::finish`].
 pub fn reconstruct_quickly(
     problem: &Problem,
     is_promising: impl Fn(&Block) -> bool,

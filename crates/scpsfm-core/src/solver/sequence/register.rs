@@ -29,9 +29,6 @@ struct Component<'a> {
 }
 
 /// Joins to a component every view that can be, as [`join_again`], and adjusts it first.
-///
-/// # Errors
-/// [`Error::Stopped`].
 pub fn join(
     problem: &Problem,
     model: &mut Model,
@@ -45,9 +42,6 @@ pub fn join(
 
 /// Joins to a component every view without a pose, or of another component, that can be. Their trials count anew: views
 /// that another component could not take may fit this one, and what stands now may place them better.
-///
-/// # Errors
-/// [`Error::Stopped`].
 pub fn join_again(
     problem: &Problem,
     model: &mut Model,

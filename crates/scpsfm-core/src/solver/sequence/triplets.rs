@@ -49,9 +49,6 @@ impl<'a> Pairs<'a> {
     }
 
     /// What is found of a triplet.
-    ///
-    /// # Errors
-    /// [`Error::Stopped`].
     pub fn attempt(&mut self, views: &[usize; 3], recorder: &mut Recorder) -> Result<Attempt, Error> {
         recorder.enter(Stage::Search);
         let found = self.reconstruction(views);
