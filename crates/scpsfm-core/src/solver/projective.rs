@@ -19,6 +19,8 @@ options! {
         /// Spread of the points of a view across the line that fits them best, in units of the noise, from which they
         /// lie off it. Points on a line are spread by one; the noise is known to a factor of two.
         least_across: f64 = 4.0,
+        /// Share of the points that is asked. A few that lie off the line of all others make no scene of it.
+        asked_share: f64 = 0.9,
     }
 }
 
@@ -83,13 +85,7 @@ impl ProjectiveReconstruction {
         let least_across = OPTIONS.least_across * NoiseOptions::DEFAULT.clamp(self.noise);
         let mut of_view = vec![Vec::new(); self.views.len()];
         self.observations.iter().for_each(|seen| of_view[seen.view].push(seen.xy));
-        let is_off_line = |points: &&Vec<Vector2<f64>>| {
-            let count = points.len().max(1) as f64;
-            let mean = points.iter().sum::<Vector2<f64>>() / count;
-            let spread: Matrix2<f64> = points.iter().map(|xy| (xy - mean) * (xy - mean).transpose()).sum();
-            (spread / count).symmetric_eigenvalues().min().max(0.0).sqrt() >= least_across
-        };
-        of_view.iter().filter(is_off_line).count() >= LEAST_VIEWS
+        of_view.into_iter().filter_map(spread_across).filter(|across| *across >= least_across).count() >= LEAST_VIEWS
     }
 
     /// The tracks with most observations, evenly among equals: a calibration takes no more than these.
@@ -200,4 +196,28 @@ fn frame_with_plane_at_infinity(plane: &Vector4<f64>) -> Option<Matrix4<f64>> {
         Some(normal) => Matrix4::identity() - 2.0 * normal * normal.transpose(),
         None => Matrix4::identity(),
     })
+}
+/// Root mean square distance of most points of a view from the line that fits those best (least trimmed squares,
+/// Rousseeuw 1984); `None` without points.
+fn spread_across(mut points: Vec<Vector2<f64>>) -> Option<f64> {
+    let asked = (OPTIONS.asked_share * points.len() as f64).ceil() as usize;
+    let (mut count, mut before) = (points.len(), f64::INFINITY);
+    loop {
+        let near = points.get(..count).filter(|near| !near.is_empty())?;
+        let mean = near.iter().sum::<Vector2<f64>>() / count as f64;
+        let covariance: Matrix2<f64> = near.iter().map(|xy| (xy - mean) * (xy - mean).transpose()).sum();
+        let axes = (covariance / count as f64).symmetric_eigen();
+        let across = axes.eigenvalues.imin();
+        let spread = axes.eigenvalues[across].max(0.0).sqrt();
+        // Points that lie off the line of the others turn the first fits, and less each time.
+        if spread >= 0.5 * before {
+            return Some(spread);
+        }
+        let normal = axes.eigenvectors.column(across).into_owned();
+        let nearer = |a: &Vector2<f64>, b: &Vector2<f64>| {
+            f64::total_cmp(&normal.dot(&(a - mean)).abs(), &normal.dot(&(b - mean)).abs())
+        };
+        points.select_nth_unstable_by(asked - 1, nearer);
+        (count, before) = (asked, spread);
+    }
 }
