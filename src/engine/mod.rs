@@ -36,7 +36,7 @@ pub use crate::telemetry::metrics::GivenUp;
 pub use drain::Drained;
 pub use error::Error;
 pub use options::Options;
-pub use submit::{Deadline, JobInput, NewJob};
+pub use submit::{Deadline, JobDescription, JobInput, NewJob};
 pub use upload::{Begun, Upload, UploadOptions};
 pub use watch::Watch;
 pub use webhooks::{JobEncoder, Options as WebhookOptions, Secrets as WebhookSecrets};

@@ -12,9 +12,6 @@ use crate::domain::{Backend, Input, InputName, Oversize, Quota, SolveSettings};
 use crate::solver;
 use crate::store::{self, NewRecord, Request, StoredInput, payload};
 
-/// Longest request id: a UUID with room for a prefix.
-const MAX_REQUEST_ID_BYTES: usize = 128;
-
 /// When a job without a result expires.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Deadline {
@@ -37,26 +34,51 @@ impl From<Input> for JobInput {
     }
 }
 
-/// What a caller wants solved.
-#[derive(Debug, Clone)]
-pub struct NewJob {
-    pub tenant: String,
+/// What a caller says of a job beside its tenant and its input.
+#[derive(Debug, Clone, Default, PartialEq)]
+pub struct JobDescription {
     /// Last part of the job's name; `None`: made here.
     pub job_id: Option<String>,
     /// Makes creation idempotent; scoped to the tenant.
     pub request_id: Option<String>,
-    pub input: JobInput,
     pub settings: SolveSettings,
     pub deadline: Option<Deadline>,
     /// Larger is sooner; 0 is the default.
     pub priority: i32,
     pub labels: BTreeMap<String, String>,
+    /// Where the job's end is to be sent.
+    pub webhook_url: Option<String>,
+}
+
+impl JobDescription {
+    /// What two requests must share to be the same: all that the caller stated but the trace, which tells the calls
+    /// apart. A relative deadline counts as stated, so that a retry is the same request.
+    fn digest(&self, input: &[u8]) -> Result<[u8; 32], Error> {
+        let deadline = match self.deadline {
+            None => None,
+            Some(Deadline::At(time)) => Some(("at", time.duration_since(SystemTime::UNIX_EPOCH).unwrap_or_default())),
+            Some(Deadline::After(duration)) => Some(("after", duration)),
+        };
+        let rest = (&self.job_id, &self.settings, deadline, self.priority, &self.labels, &self.webhook_url);
+        let rest = payload::encode(&rest)?;
+        let mut hash = Sha256::new();
+        hash.update((rest.len() as u64).to_le_bytes());
+        hash.update(rest);
+        hash.update(input);
+        Ok(hash.finalize().into())
+    }
+}
+
+/// A job that is to be stored.
+#[derive(Debug, Clone)]
+pub struct NewJob {
+    pub tenant: String,
+    pub description: JobDescription,
+    pub input: JobInput,
     /// W3C `traceparent` of the call.
     pub trace_parent: Option<String>,
     /// Whether the call attaches to the job, see [`Engine::detach`]. No part of what makes two requests the same.
     pub cancel_on_disconnect: bool,
-    /// Where the job's end is to be sent.
-    pub webhook_url: Option<String>,
 }
 
 /// Observations that are encoded on a thread that serves others: some 40 kB to encode and to hash, which needs no
@@ -64,35 +86,14 @@ pub struct NewJob {
 const FEW_OBSERVATIONS: usize = 2_000;
 
 impl NewJob {
-    /// A job with nothing but what every job has.
-    pub fn new(tenant: impl Into<String>, input: impl Into<JobInput>, settings: SolveSettings) -> Self {
-        Self {
-            tenant: tenant.into(),
-            job_id: None,
-            request_id: None,
-            input: input.into(),
-            settings,
-            deadline: None,
-            priority: 0,
-            labels: BTreeMap::new(),
-            trace_parent: None,
-            cancel_on_disconnect: false,
-            webhook_url: None,
-        }
-    }
-
     fn validate(&self, webhooks: Option<&WebhookOptions>) -> Result<(), Error> {
         let mut found = Violations::default();
         let id_rule = "1 to 63 of a-z, 0-9 and -, not beginning or ending with -";
         if !JobName::is_id(&self.tenant) {
             found.push(Violation::of("tenant", format!("{} is not an id: {id_rule}", quoted(&self.tenant))));
         }
-        if let Some(id) = self.job_id.as_ref().filter(|id| !JobName::is_id(id)) {
+        if let Some(id) = self.description.job_id.as_ref().filter(|id| !JobName::is_id(id)) {
             found.push(Violation::of("job_id", format!("{} is not an id: {id_rule}", quoted(id))));
-        }
-        if let Some(id) = self.request_id.as_ref().filter(|id| id.is_empty() || id.len() > MAX_REQUEST_ID_BYTES) {
-            let length = id.len();
-            found.push(Violation::of("request_id", format!("{length} bytes are not in 1..={MAX_REQUEST_ID_BYTES}")));
         }
         if let JobInput::Uploaded(name) = &self.input
             && name.tenant != self.tenant
@@ -100,10 +101,10 @@ impl NewJob {
             return Err(StoreError::InputNotFound(name.clone()).into());
         }
         found.into_result()?;
-        if let Some(url) = &self.webhook_url {
+        if let Some(url) = &self.description.webhook_url {
             webhooks::check(webhooks, &self.tenant, url)?;
         }
-        Ok(self.settings.validate()?)
+        Ok(self.description.settings.validate()?)
     }
 
     /// What is stored; `uploaded` is the input that it names, where it names one. Encodes and, for a request id, hashes
@@ -129,50 +130,32 @@ impl NewJob {
             store::JobInput::Inline(bytes) => bytes.as_slice(),
             store::JobInput::Uploaded { .. } => &named,
         };
-        let request = match &self.request_id {
-            Some(id) => Some(Request { id: id.clone(), digest: self.digest(digested)? }),
-            None => None,
-        };
-        let deadline = match self.deadline {
+        let has_id = self.description.request_id.is_some();
+        let digest = has_id.then(|| self.description.digest(digested)).transpose()?;
+        let JobDescription { job_id, request_id, settings, deadline, priority, labels, webhook_url } = self.description;
+        let deadline = match deadline {
             None => None,
             Some(Deadline::At(time)) => Some(time),
             Some(Deadline::After(duration)) => Some(now.checked_add(duration).ok_or_else(|| {
                 Error::InvalidArgument(Violation::of("deadline", "lies beyond the end of time").into())
             })?),
         };
-        let job = self.job_id.unwrap_or_else(|| uuid::Uuid::now_v7().to_string());
+        let job = job_id.unwrap_or_else(|| uuid::Uuid::now_v7().to_string());
         Ok(NewRecord {
             name: JobName { tenant: self.tenant, job },
-            request,
+            request: request_id.zip(digest).map(|(id, digest)| Request { id, digest }),
             view_count,
             track_count,
             observation_count,
             input,
-            settings: SolveSettings { backend: Some(self.settings.backend.unwrap_or(backend)), ..self.settings },
+            settings: SolveSettings { backend: Some(settings.backend.unwrap_or(backend)), ..settings },
             deadline,
-            priority: self.priority,
-            labels: self.labels,
+            priority,
+            labels,
             trace_parent: self.trace_parent,
             cancel_on_disconnect: self.cancel_on_disconnect,
-            webhook_url: self.webhook_url,
+            webhook_url,
         })
-    }
-
-    /// What two requests must share to be the same: all that the caller stated but the trace, which tells the calls
-    /// apart. A relative deadline counts as stated, so that a retry is the same request.
-    fn digest(&self, input: &[u8]) -> Result<[u8; 32], Error> {
-        let deadline = match self.deadline {
-            None => None,
-            Some(Deadline::At(time)) => Some(("at", time.duration_since(SystemTime::UNIX_EPOCH).unwrap_or_default())),
-            Some(Deadline::After(duration)) => Some(("after", duration)),
-        };
-        let rest = (&self.job_id, &self.settings, deadline, self.priority, &self.labels, &self.webhook_url);
-        let rest = payload::encode(&rest)?;
-        let mut hash = Sha256::new();
-        hash.update((rest.len() as u64).to_le_bytes());
-        hash.update(rest);
-        hash.update(input);
-        Ok(hash.finalize().into())
     }
 }
 

@@ -56,9 +56,12 @@ pub enum Begun {
 pub struct Upload {
     engine: Engine,
     lease: UploadLease,
-    committed: u64,
-    bytes: u64,
-    sha256: Option<[u8; 32]>,
+    /// Bytes that are stored.
+    pub committed: u64,
+    /// Bytes that were declared.
+    pub bytes: u64,
+    /// SHA-256 that was declared, if any was.
+    pub sha256: Option<[u8; 32]>,
 }
 
 impl Engine {
@@ -127,21 +130,6 @@ impl Inner {
 }
 
 impl Upload {
-    /// Bytes that are stored.
-    pub fn committed(&self) -> u64 {
-        self.committed
-    }
-
-    /// Bytes that were declared.
-    pub fn bytes(&self) -> u64 {
-        self.bytes
-    }
-
-    /// SHA-256 that was declared, if any was.
-    pub fn sha256(&self) -> Option<[u8; 32]> {
-        self.sha256
-    }
-
     /// Stores bytes at the end.
     ///
     /// # Errors

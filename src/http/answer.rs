@@ -8,6 +8,7 @@ use axum::http::{HeaderValue, StatusCode, header};
 use axum::response::sse::{Event, KeepAlive, Sse};
 use axum::response::{IntoResponse, Response};
 use futures_util::stream::{self, Stream, StreamExt};
+use http_body_util::BodyExt;
 use prost::bytes::Bytes;
 use prost_reflect::{DynamicMessage, MessageDescriptor};
 use serde_json::{Map, Value, json};
@@ -15,7 +16,7 @@ use tonic::{Code, Status, Streaming};
 use tonic_types::StatusExt;
 
 use crate::rpc::access_log::code_name;
-use crate::rpc::inflight::{HeldBody, Permit};
+use crate::rpc::inflight::Permit;
 use crate::rpc::status;
 use crate::telemetry::metrics::{HttpRefusal, http_refused};
 
@@ -43,7 +44,10 @@ pub fn message(descriptor: &MessageDescriptor, bytes: &[u8]) -> Result<Vec<u8>, 
 
 /// An answer of that JSON; the permit is held until it is read.
 pub fn json(text: Vec<u8>, permit: Permit) -> Answer {
-    let body = Body::new(HeldBody { body: Body::from(text), permit });
+    let body = Body::new(Body::from(text).map_err(move |error| {
+        let _held = &permit;
+        error
+    }));
     secured((StatusCode::OK, [(header::CONTENT_TYPE, "application/json")], body).into_response())
 }
 

@@ -25,10 +25,10 @@ use super::unique_keys::UniqueKeys;
 use super::{Options, console, download, grpc_web, openapi, upload};
 use crate::domain::error::quoted;
 use crate::domain::job::JobState;
-use crate::rpc::caller::Tenant;
 use crate::rpc::convert::enums::Twin;
 use crate::rpc::convert::names;
 use crate::rpc::inflight::Permit;
+use crate::rpc::keys::Grant;
 use crate::rpc::listener::ConnectionInfo;
 use crate::rpc::proto::job_service_client::JobServiceClient;
 use crate::rpc::server::Gateway;
@@ -169,12 +169,12 @@ impl Api {
         Err(other_method(&path, &allowed))
     }
 
-    /// The tenant of the request's key, where one is asked for.
+    /// What the request's key stands for, where one is asked for.
     pub(super) fn check_key(
         &self,
         headers: &HeaderMap,
         connection_info: &ConnectionInfo,
-    ) -> Result<Tenant, Box<Answer>> {
+    ) -> Result<Grant, Box<Answer>> {
         let checked = self.gateway.check_key(headers, connection_info);
         checked.map_err(|status| answer::uncalled(HttpRefusal::Unauthenticated, &status))
     }
@@ -187,7 +187,7 @@ impl Api {
         request: Request,
     ) -> Result<Answer, Box<Answer>> {
         let (head, body) = request.into_parts();
-        let tenant = self.check_key(&head.headers, &connection_info)?;
+        let grant = self.check_key(&head.headers, &connection_info)?;
         let permit = self.gateway.permit();
         let descriptor = route.method.input();
         let query = head.uri.query().unwrap_or_default();
@@ -216,7 +216,7 @@ impl Api {
         for (name, value) in fields {
             let in_body = message.get_field_by_name(name).and_then(|field| field.as_str().map(str::to_owned));
             if let Some(in_body) = in_body.filter(|text| !text.is_empty())
-                && names::resolved(&in_body, tenant.id()) != names::resolved(&value, tenant.id())
+                && names::resolved(&in_body, &grant.tenant) != names::resolved(&value, &grant.tenant)
             {
                 return Err(invalid(name, format!("{} is not the path's {value}", quoted(&in_body))));
             }
@@ -315,8 +315,9 @@ impl Api {
             let bytes = JSON_COPIES * length as u64 + OBJECT_BYTES * objects;
             if !permit.could_hold(bytes) {
                 let text = format!(
-                    "the body's {objects} objects and {length} bytes may take {bytes} bytes in memory, which is more \
-                     than server.max_inflight_bytes; a larger input is uploaded as protobuf, or sent over gRPC"
+                    "the first {length} bytes of the body, with {objects} objects, may take {bytes} bytes in memory, \
+                     which is more than server.max_inflight_bytes; a larger input is uploaded as protobuf, or sent over \
+                     gRPC"
                 );
                 return Err(answer::refuse(HttpRefusal::TooLarge, text));
             }

@@ -10,7 +10,7 @@ use tonic::codegen::http::header::{AUTHORIZATION, CONTENT_TYPE};
 use tonic::codegen::http::{HeaderMap, Method, Request};
 
 use super::access_log::CallRecord;
-use super::caller::{Caller, Tenant};
+use super::caller::Caller;
 use super::keys::{Grant, Hash, KeyRing};
 use super::listener::ConnectionInfo;
 use super::rates::Rates;
@@ -46,12 +46,12 @@ impl Authenticate {
         self.keys.is_some()
     }
 
-    /// The tenant of the key that these headers hold; where none is asked for, everyone's.
+    /// What the key that these headers hold stands for; where none is asked for, what everyone has.
     ///
     /// # Errors
     /// `UNAUTHENTICATED`.
-    pub fn check(&self, headers: &HeaderMap) -> Result<Tenant, Status> {
-        self.identify(headers).map(|(tenant, _)| tenant)
+    pub fn check(&self, headers: &HeaderMap) -> Result<Grant, Status> {
+        self.identify(headers).map(|(grant, _)| grant)
     }
 
     /// Lets a call in: tells its services whose it is. Returns the key that it depends on.
@@ -66,30 +66,30 @@ impl Authenticate {
             }
             return Ok(CallKey::default());
         }
-        let (tenant, key) = self.identify(request.headers())?;
+        let (grant, key) = self.identify(request.headers())?;
         mark_authenticated(request);
         let hash = key.0.as_ref().map(|accepted| &accepted.key);
-        record.identify(tenant.id(), hash.map(Hash::fingerprint));
+        record.identify(&grant.tenant, hash.map(Hash::fingerprint));
         // Without keys everyone may do everything.
         let needed = methods::scope_of(request.uri().path());
         if key.0.as_ref().is_some_and(|accepted| accepted.grant.scope < needed) {
             return Err(status::scope_missing(needed));
         }
         self.rates.call(hash)?;
-        let caller = Caller::new(tenant, request.headers(), self.rates.clone(), record.clone());
+        let caller = Caller::new(grant, request.headers(), self.rates.clone(), record.clone());
         request.extensions_mut().insert(caller);
         // No service needs it any more, and none can let it slip.
         request.headers_mut().remove(AUTHORIZATION);
         Ok(key)
     }
 
-    fn identify(&self, headers: &HeaderMap) -> Result<(Tenant, CallKey), Status> {
-        let Some(keys) = &self.keys else { return Ok((Tenant::default(), CallKey::default())) };
+    fn identify(&self, headers: &HeaderMap) -> Result<(Grant, CallKey), Status> {
+        let Some(keys) = &self.keys else { return Ok((Grant::default(), CallKey::default())) };
         let key = Hash::of(bearer(headers)?);
         let mut keys = keys.clone();
         let grant = keys.borrow_and_update().grant_of_hash(&key).cloned();
         let grant = grant.ok_or_else(status::unknown_key)?;
-        Ok((Tenant::of(&grant), CallKey(Some(AcceptedKey { keys, key, grant }))))
+        Ok((grant.clone(), CallKey(Some(AcceptedKey { keys, key, grant }))))
     }
 }
 
@@ -172,8 +172,8 @@ mod tests {
         let (_sender, keys) = watch::channel(Arc::new(ring));
         let layer = Authenticate::new(Some(keys), any_rate());
         for right in ["Bearer", "bearer", "BEARER"] {
-            let (tenant, _) = layer.identify(&headers(&[&format!("{right} {KEY}")])).expect("known");
-            assert_eq!(tenant, Tenant::new("north"));
+            let (grant, _) = layer.identify(&headers(&[&format!("{right} {KEY}")])).expect("known");
+            assert_eq!(grant.tenant, "north");
         }
         let bearer = format!("Bearer {KEY}");
         let wrong: [&[&str]; 8] = [
@@ -195,7 +195,7 @@ mod tests {
 
     #[test]
     fn without_keys_everyone_is_of_the_default_tenant() {
-        let (tenant, key) = Authenticate::new(None, any_rate()).identify(&headers(&[])).expect("open");
-        assert!(tenant == Tenant::default() && key.0.is_none());
+        let (grant, key) = Authenticate::new(None, any_rate()).identify(&headers(&[])).expect("open");
+        assert!(grant == Grant::default() && key.0.is_none());
     }
 }

@@ -74,8 +74,7 @@ where
             }
         };
         let (lost, lost_later) = (key.lost(), key.lost());
-        let request = MessageBody::in_place(request, *max_message_bytes, permit.clone(), record);
-        let request = request.map(|messages| RequestBody { messages, lost: Some(key.lost()) });
+        let request = MessageBody::in_place(request, *max_message_bytes, permit.clone(), record, key.lost());
         let answer = self.inner.call(request.map(Body::new));
         Box::pin(async move {
             let answer = tokio::select! {
@@ -84,31 +83,6 @@ where
             };
             Ok(AnswerBody::of(answer, call, lost_later, permit))
         })
-    }
-}
-
-/// The messages of a request, as long as its key stands.
-struct RequestBody {
-    messages: MessageBody,
-    /// `None`: it was lost, and nothing follows.
-    lost: Option<Lost>,
-}
-
-impl HttpBody for RequestBody {
-    type Data = Bytes;
-    type Error = Status;
-
-    fn poll_frame(mut self: Pin<&mut Self>, context: &mut Context<'_>) -> Poll<Option<Result<Frame<Bytes>, Status>>> {
-        let Some(lost) = &mut self.lost else { return Poll::Ready(None) };
-        if lost.as_mut().poll(context).is_ready() {
-            self.lost = None;
-            return Poll::Ready(Some(Err(status::withdrawn_key())));
-        }
-        Pin::new(&mut self.messages).poll_frame(context)
-    }
-
-    fn is_end_stream(&self) -> bool {
-        self.lost.is_none() || self.messages.is_end_stream()
     }
 }
 

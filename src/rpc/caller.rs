@@ -13,46 +13,16 @@ use super::keys::{Grant, Scope};
 use super::rates::Rates;
 use super::status;
 use crate::domain::InputName;
-use crate::domain::job::{DEFAULT_TENANT, Job, JobName};
+use crate::domain::job::{Job, JobName};
 use crate::telemetry::tracing::AUDIT;
 
 /// Header of the W3C trace context.
 pub const TRACE_PARENT: &str = "traceparent";
 
-/// The tenant of a call.
-#[derive(Debug, Clone, PartialEq, Eq)]
-pub struct Tenant {
-    id: String,
-    /// Whether the caller may name what other tenants have, as an administrator.
-    reaches_all: bool,
-}
-
-impl Tenant {
-    pub fn new(id: impl Into<String>) -> Self {
-        Self { id: id.into(), reaches_all: false }
-    }
-
-    pub fn id(&self) -> &str {
-        &self.id
-    }
-
-    /// The tenant of a key.
-    pub fn of(grant: &Grant) -> Self {
-        Self { id: grant.tenant.clone(), reaches_all: grant.scope == Scope::Admin }
-    }
-}
-
-impl Default for Tenant {
-    /// Everyone's where nobody needs a key.
-    fn default() -> Self {
-        Self::new(DEFAULT_TENANT)
-    }
-}
-
 /// The caller of one call: the one place where a service learns whose it is.
 #[derive(Debug, Clone)]
 pub struct Caller {
-    tenant: Tenant,
+    grant: Grant,
     trace_parent: Option<String>,
     rates: Arc<Rates>,
     record: Arc<CallRecord>,
@@ -61,9 +31,9 @@ pub struct Caller {
 impl Caller {
     /// Of a call with these headers, for [`Authenticate`](super::auth::Authenticate), which puts it into the request's
     /// extensions.
-    pub fn new(tenant: Tenant, headers: &HeaderMap, rates: Arc<Rates>, record: Arc<CallRecord>) -> Self {
+    pub fn new(grant: Grant, headers: &HeaderMap, rates: Arc<Rates>, record: Arc<CallRecord>) -> Self {
         let trace_parent = headers.get(TRACE_PARENT).and_then(|value| value.to_str().ok()).map(str::to_owned);
-        Self { tenant, trace_parent, rates, record }
+        Self { grant, trace_parent, rates, record }
     }
 
     /// # Errors
@@ -79,7 +49,7 @@ impl Caller {
     /// # Errors
     /// `RESOURCE_EXHAUSTED`, reason `RATE_LIMITED`.
     pub fn count_jobs(&self, count: usize) -> Result<(), Status> {
-        self.rates.jobs(self.tenant.id(), count)
+        self.rates.jobs(&self.grant.tenant, count)
     }
 
     /// Writes into the audit log that the caller did this to the resource, or tried to.
@@ -91,7 +61,7 @@ impl Caller {
     pub fn audit_jobs(&self, method: &'static str, created: Result<&[Job], &Status>) {
         match created {
             Ok(jobs) => jobs.iter().for_each(|job| self.write_audit(method, &job.name, Code::Ok)),
-            Err(status) => self.write_audit(method, &format_args!("tenants/{}", self.tenant.id()), status.code()),
+            Err(status) => self.write_audit(method, &format_args!("tenants/{}", &self.grant.tenant), status.code()),
         }
     }
 
@@ -117,7 +87,7 @@ impl Caller {
     fn write_audit(&self, method: &'static str, resource: &dyn Display, code: Code) {
         tracing::info!(
             target: AUDIT,
-            tenant = self.tenant.id(),
+            tenant = self.grant.tenant,
             key = self.record.key(),
             peer = self.record.peer(),
             method,
@@ -134,7 +104,7 @@ impl Caller {
 
     /// Whether the caller may name what this tenant has.
     fn reaches(&self, tenant: &str) -> bool {
-        self.tenant.reaches_all || tenant == self.tenant.id
+        self.grant.scope == Scope::Admin || tenant == self.grant.tenant
     }
 
     /// The tenant that `parent` names, which is the caller's own where that is left out, and must be for all but
@@ -143,7 +113,7 @@ impl Caller {
     /// # Errors
     /// `INVALID_ARGUMENT` for another form, `NOT_FOUND` for another tenant, whether there is one of that name or not.
     pub fn parent(&self, parent: &str) -> Result<String, Status> {
-        let tenant = names::tenant(parent, &self.tenant.id).map_err(status::invalid)?;
+        let tenant = names::tenant(parent, &self.grant.tenant).map_err(status::invalid)?;
         if self.reaches(&tenant) { Ok(tenant) } else { Err(status::tenant_not_found(&tenant)) }
     }
 
@@ -152,7 +122,7 @@ impl Caller {
     /// # Errors
     /// `INVALID_ARGUMENT` for another form, `NOT_FOUND` for another tenant's.
     pub fn job(&self, name: &str) -> Result<JobName, Status> {
-        let name = names::job(name, &self.tenant.id).map_err(status::invalid)?;
+        let name = names::job(name, &self.grant.tenant).map_err(status::invalid)?;
         if self.reaches(&name.tenant) { Ok(name) } else { Err(status::job_not_found(&name)) }
     }
 
@@ -162,7 +132,7 @@ impl Caller {
     /// # Errors
     /// `INVALID_ARGUMENT` for another form, `NOT_FOUND` for another tenant's.
     pub fn input(&self, name: &str, field: &str) -> Result<InputName, Status> {
-        let name = names::input(name, field, &self.tenant.id).map_err(status::invalid)?;
+        let name = names::input(name, field, &self.grant.tenant).map_err(status::invalid)?;
         if self.reaches(&name.tenant) { Ok(name) } else { Err(status::input_not_found(&name)) }
     }
 }
@@ -177,16 +147,16 @@ mod tests {
     #[test]
     fn other_tenants_are_out_of_reach() {
         assert_eq!(Caller::of(&Request::new(())).expect_err("no caller").code(), Code::Internal);
-        let caller = |tenant| {
+        let caller = |grant| {
             let rates = Rates::new(rates::Options::default(), DefaultClock::default());
-            Caller::new(tenant, &HeaderMap::new(), Arc::new(rates), Arc::default())
+            Caller::new(grant, &HeaderMap::new(), Arc::new(rates), Arc::default())
         };
         let of = |scope| {
-            let tenant = Tenant::of(&Grant { tenant: "north".into(), scope });
-            caller(tenant).job("tenants/other/jobs/a").is_ok()
+            let grant = Grant { tenant: "north".into(), scope };
+            caller(grant).job("tenants/other/jobs/a").is_ok()
         };
         assert_eq!(Scope::ALL.map(of), [false, false, true], "an administrator names every tenant's");
-        let caller = caller(Tenant::default());
+        let caller = caller(Grant::default());
         assert_eq!(caller.parent("tenants/default").expect("own"), "default");
         assert_eq!(caller.parent("tenants/other").expect_err("another's").code(), Code::NotFound);
         assert_eq!(caller.parent("default").expect_err("malformed").code(), Code::InvalidArgument);

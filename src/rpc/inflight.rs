@@ -2,11 +2,8 @@
 //! a call that would go beyond it is refused at once. What a job takes later, in the store and in the solver, is
 //! bounded there.
 
-use std::pin::Pin;
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
-use std::task::{Context, Poll};
 
-use http_body::{Body as HttpBody, Frame, SizeHint};
 use tonic::Status;
 
 use super::status;
@@ -152,33 +149,6 @@ impl Drop for Shared {
     fn drop(&mut self) {
         let charge = self.charge.get_mut().unwrap_or_else(PoisonError::into_inner);
         self.budget.exchange(charge.bytes().min(self.budget.max_bytes), 0);
-    }
-}
-
-/// An answer's body, with the permit of what it is made of: a reader that is slow holds it.
-#[derive(Debug)]
-pub struct HeldBody<B> {
-    pub body: B,
-    pub permit: Permit,
-}
-
-impl<B: HttpBody + Unpin> HttpBody for HeldBody<B> {
-    type Data = B::Data;
-    type Error = B::Error;
-
-    fn poll_frame(
-        mut self: Pin<&mut Self>,
-        context: &mut Context<'_>,
-    ) -> Poll<Option<Result<Frame<B::Data>, B::Error>>> {
-        Pin::new(&mut self.body).poll_frame(context)
-    }
-
-    fn is_end_stream(&self) -> bool {
-        self.body.is_end_stream()
-    }
-
-    fn size_hint(&self) -> SizeHint {
-        self.body.size_hint()
     }
 }
 

@@ -101,8 +101,8 @@ impl Inputs {
     async fn finish(&self, upload: Upload, sha256: [u8; 32], permit: &Permit) -> Result<proto::Input, Status> {
         let _turn = self.decoders.acquire().await.map_err(|error| status::internal(&error))?;
         let largest = self.limits.max_observations as u64 * input::OBSERVATION_BYTES;
-        permit.hold(WORKING_COPIES * upload.bytes().min(largest))?;
-        let length = usize::try_from(upload.bytes()).map_err(|error| status::internal(&error))?;
+        permit.hold(WORKING_COPIES * upload.bytes.min(largest))?;
+        let length = usize::try_from(upload.bytes).map_err(|error| status::internal(&error))?;
         let (sender, reader) = UploadReader::new(length);
         let limits = self.limits.clone();
         let decode = super::blocking(move || {
@@ -121,7 +121,7 @@ impl Inputs {
         let input = match draft {
             Ok(draft) => {
                 // Matches take more while they are joined than their bytes told.
-                permit.hold(WORKING_COPIES * draft.bytes().max(upload.bytes().min(largest)))?;
+                permit.hold(WORKING_COPIES * draft.bytes().max(upload.bytes.min(largest)))?;
                 super::blocking(move || draft.finish()).await?
             }
             Err(invalid) => Err(invalid),
@@ -169,11 +169,11 @@ impl Reception {
     }
 
     fn received(&self) -> u64 {
-        self.upload.committed() + self.gathered.len() as u64
+        self.upload.committed + self.gathered.len() as u64
     }
 
     fn progress(&self) -> String {
-        format!("{} of {} bytes, which are kept", self.received(), self.upload.bytes())
+        format!("{} of {} bytes, which are kept", self.received(), self.upload.bytes)
     }
 
     async fn take(&mut self, chunk: proto::UploadChunk) -> Result<(), Status> {
@@ -190,8 +190,8 @@ impl Reception {
                 format!("{length} bytes at offset {received} are not 1 to {MAX_CHUNK_BYTES}"),
             );
         }
-        if received + length as u64 > self.upload.bytes() {
-            let declared = self.upload.bytes();
+        if received + length as u64 > self.upload.bytes {
+            let declared = self.upload.bytes;
             return invalid(
                 "chunk.data",
                 format!("{length} bytes at offset {received} go beyond the {declared} declared"),
@@ -208,10 +208,10 @@ impl Reception {
     fn check_finish(&self, finish: &proto::UploadFinish) -> Result<[u8; 32], Status> {
         let invalid = |field: &str, text: String| Err(status::violation(field, text));
         let sha256 = digest(&finish.sha256, "finish.sha256")?;
-        if self.received() != self.upload.bytes() {
+        if self.received() != self.upload.bytes {
             return invalid("finish", format!("comes too early, at {}", self.progress()));
         }
-        match self.upload.sha256() {
+        match self.upload.sha256 {
             Some(declared) if declared != sha256 => invalid("finish.sha256", "is not that of the start".into()),
             _ => Ok(sha256),
         }

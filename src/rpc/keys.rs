@@ -11,7 +11,7 @@ use serde::{Deserialize, Deserializer};
 use sha2::{Digest as _, Sha256};
 use subtle::ConstantTimeEq;
 
-use crate::domain::job::JobName;
+use crate::domain::job::{DEFAULT_TENANT, JobName};
 
 /// Shortest key: 128 random bits in hexadecimal. Anything shorter could be guessed from its hash.
 const MIN_KEY_CHARS: usize = 32;
@@ -79,6 +79,13 @@ impl Scope {
 pub struct Grant {
     pub tenant: String,
     pub scope: Scope,
+}
+
+impl Default for Grant {
+    /// Everyone's where nobody needs a key.
+    fn default() -> Self {
+        Self { tenant: DEFAULT_TENANT.into(), scope: Scope::Ordinary }
+    }
 }
 
 /// Keys and what they stand for.

@@ -18,9 +18,10 @@ use tonic::body::Body;
 use tonic::codegen::http::Request;
 
 use super::access_log::CallRecord;
+use super::auth::Lost;
 use super::decoded_size::{self, MessageType};
 use super::inflight::Permit;
-use super::inputs;
+use super::{inputs, status};
 
 /// In front of each message: whether it is compressed (1) or not (0), and its length (four bytes, big-endian).
 const HEADER_BYTES: usize = 5;
@@ -55,17 +56,21 @@ pub struct MessageBody {
     has_ended: bool,
     permit: Permit,
     record: Arc<CallRecord>,
+    /// Ends with the key of the call; `None`: it has, and nothing follows.
+    lost: Option<Lost>,
 }
 
 impl MessageBody {
     /// Puts the messages of a request in the place of its body. Its headers no longer say that they are compressed.
     ///
     /// * `max_bytes`: largest message, compressed and decompressed
+    /// * `lost`: ends with the key of the call
     pub fn in_place(
         request: Request<Body>,
         max_bytes: usize,
         permit: Permit,
         record: Arc<CallRecord>,
+        lost: Lost,
     ) -> Request<Self> {
         let (mut parts, body) = request.into_parts();
         let message_type = decoded_size::taken_by(parts.uri.path());
@@ -77,8 +82,8 @@ impl MessageBody {
         // The length of a message has four bytes.
         let max_bytes = max_bytes.min(of_service).min(u32::MAX as usize);
         let (buffer, passes) = (BytesMut::new(), message_type.is_none());
-        let messages =
-            Self { body, message_type, is_gzip, max_bytes, buffer, passes, has_ended: false, permit, record };
+        let (has_ended, lost) = (false, Some(lost));
+        let messages = Self { body, message_type, is_gzip, max_bytes, buffer, passes, has_ended, permit, record, lost };
         Request::from_parts(parts, messages)
     }
 
@@ -154,6 +159,11 @@ impl HttpBody for MessageBody {
     type Error = Status;
 
     fn poll_frame(mut self: Pin<&mut Self>, context: &mut Context<'_>) -> Poll<Option<Result<Frame<Bytes>, Status>>> {
+        let Some(lost) = &mut self.lost else { return Poll::Ready(None) };
+        if lost.as_mut().poll(context).is_ready() {
+            self.lost = None;
+            return Poll::Ready(Some(Err(status::withdrawn_key())));
+        }
         loop {
             if let Some(message) = self.next().transpose() {
                 return Poll::Ready(Some(message.map(Frame::data)));
@@ -179,12 +189,13 @@ impl HttpBody for MessageBody {
     }
 
     fn is_end_stream(&self) -> bool {
-        self.buffer.is_empty() && (self.has_ended || self.body.is_end_stream())
+        self.lost.is_none() || self.buffer.is_empty() && (self.has_ended || self.body.is_end_stream())
     }
 }
 
 #[cfg(test)]
 mod tests {
+    use std::future::pending;
     use std::io::Write;
 
     use flate2::Compression;
@@ -239,7 +250,8 @@ mod tests {
         }
         let request = request.body(body).expect("a request");
         let (budget, record) = (Budget::new(u64::MAX), Arc::new(CallRecord::default()));
-        let request = MessageBody::in_place(request, max_bytes, Permit::new(Arc::clone(&budget)), record);
+        let request =
+            MessageBody::in_place(request, max_bytes, Permit::new(Arc::clone(&budget)), record, Box::pin(pending()));
         let is_taken = encoding == Some("gzip") && path.starts_with("/scpsfm");
         assert_eq!(request.headers().contains_key(ENCODING), encoding.is_some() && !is_taken);
         let mut messages = request.into_body();

@@ -23,12 +23,11 @@ use super::admin::Admin;
 use super::auth::Authenticate;
 use super::calibration::{self, Calibration};
 use super::call::{CallLayer, CallService};
-use super::caller::Tenant;
 use super::health::Health;
 use super::inflight::{Budget, Permit};
 use super::inputs::Inputs;
 use super::jobs::Jobs;
-use super::keys::{self, KeyRing};
+use super::keys::{self, Grant, KeyRing};
 use super::listener::{self, ConnectionInfo, Listener};
 use super::proto::FILE_DESCRIPTOR_SET;
 use super::proto::admin_service_server::AdminServiceServer;
@@ -333,7 +332,7 @@ impl Gateway {
     ///
     /// # Errors
     /// `UNAUTHENTICATED`.
-    pub fn check_key(&self, headers: &HeaderMap, connection_info: &ConnectionInfo) -> Result<Tenant, Status> {
+    pub fn check_key(&self, headers: &HeaderMap, connection_info: &ConnectionInfo) -> Result<Grant, Status> {
         let checked = self.calls.authenticate.check(headers);
         let tenant = checked.inspect_err(|status| self.log_refused(status, connection_info))?;
         connection_info.set_authenticated();

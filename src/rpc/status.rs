@@ -1,41 +1,5 @@
-//! The one place where errors become statuses (AIP-193): a code, a reason that programs can match, and what to do.
-//!
-//! | code | reason | when |
-//! |---|---|---|
-//! | `INVALID_ARGUMENT` | `INVALID_ARGUMENT` | a request breaks a rule; `BadRequest` names fields and indices |
-//! | `NOT_FOUND` | `JOB_NOT_FOUND` | no such job, or another tenant's |
-//! | `NOT_FOUND` | `TENANT_NOT_FOUND` | a parent that is not the caller's tenant, whether it exists or not |
-//! | `UNAUTHENTICATED` | `API_KEY_MISSING` | the server asks for a key, and the call carries none |
-//! | `UNAUTHENTICATED` | `API_KEY_UNKNOWN` | the call carries a key that stands for no tenant |
-//! | `UNAUTHENTICATED` | `API_KEY_WITHDRAWN` | the key was withdrawn while the call lasted, within seconds |
-//! | `PERMISSION_DENIED` | `SCOPE` | the key's scope does not allow the call; `metadata["scope"]` is the least one that does |
-//! | `ALREADY_EXISTS` | `JOB_ID_TAKEN` | the tenant has a job of that id |
-//! | | `REQUEST_ID_REUSED` | the request id came before with another body |
-//! | | `UPLOAD_ID_REUSED` | the upload id came before with another length or hash |
-//! | `NOT_FOUND` | `INPUT_NOT_FOUND` | no such uploaded input, or another tenant's |
-//! | `NOT_FOUND` | `UPLOAD_NOT_FOUND` | no such upload, or it was given up |
-//! | `DATA_LOSS` | `CHUNK_CORRUPTED` | a chunk of an upload does not match its CRC-32C; `metadata["offset"]` says which |
-//! | `DATA_LOSS` | `HASH_MISMATCH` | the bytes of an upload do not have the SHA-256 that `finish` names |
-//! | `ABORTED` | `UPLOAD_TAKEN_OVER` | another stream goes on with the upload |
-//! | `RESOURCE_EXHAUSTED` | `UPLOADS_FULL` | the tenant has uploaded as much as it may, by the bound of `metadata["bound"]`: `tenant_uploads` or `tenant_upload_bytes`; `RetryInfo` |
-//! | `INVALID_ARGUMENT` | `UPLOAD_TOO_LARGE` | the upload alone is more than the bound of `metadata["bound"]` ever allows: `upload_bytes` or `tenant_upload_bytes`; `metadata` has `key`, `asked` and `max` too |
-//! | `INVALID_ARGUMENT` | `MALFORMED_MESSAGE` | a message that cannot be decoded |
-//! | `OUT_OF_RANGE` | `MESSAGE_TOO_LARGE` | a message above `Capabilities.input_limits.max_message_bytes`, compressed or not, or above eight times that once decoded |
-//! | `RESOURCE_EXHAUSTED` | `QUEUE_FULL` | admission refused, by the queue's bound of `metadata["bound"]`: `jobs`, `bytes`, `observations`, `tenant_jobs` or `tenant_bytes`; `RetryInfo` says when to come back |
-//! | `INVALID_ARGUMENT` | `BATCH_TOO_LARGE` | the batch alone is more than the queue's bound of `metadata["bound"]` ever allows, named as for `QUEUE_FULL`; `metadata` has `key`, `asked` and `max` too |
-//! | `INVALID_ARGUMENT` | `JOB_TOO_LARGE` | the solver would take more memory for the job than `engine.max_solver_bytes`; `metadata` as for `BATCH_TOO_LARGE` |
-//! | `RESOURCE_EXHAUSTED` | `MEMORY` | the calls under way hold as many bytes as they may together; `RetryInfo`. Nothing was stored but the chunks of an upload |
-//! | `RESOURCE_EXHAUSTED` | `RATE_LIMITED` | more calls of the key, or more new jobs of the tenant, than the rate of `metadata["key"]` allows; `RetryInfo` says after what time this one would pass |
-//! | `RESOURCE_EXHAUSTED` | `STORE_FULL` | the server's disk is full and nothing was stored; `RetryInfo`. What was acknowledged before is there |
-//! | `FAILED_PRECONDITION` | `JOB_NOT_ENDED` | a job that waits or runs is not deleted; cancel it first |
-//! | `FAILED_PRECONDITION` | `JOB_SUCCEEDED` | a job that has succeeded is not retried |
-//! | `FAILED_PRECONDITION` | `JOB_NOT_QUEUED` | only a job that waits gets another priority |
-//! | `ABORTED` | `ETAG_MISMATCH` | the job changed since its etag was read |
-//! | `FAILED_PRECONDITION` | `RESULT_NOT_READY` | there is no result, yet or for good |
-//! | `UNAVAILABLE` | `DRAINING` | the server is going down; `RetryInfo` |
-//! | `UNAVAILABLE` | `STORE_UNAVAILABLE` | the database is away; `RetryInfo`. A creation may have been stored: come back with the same request id |
-//! | `DEADLINE_EXCEEDED` | `INPUT_STALLED` | the chunks of a `Solve` or of an upload stopped coming |
-//! | `INTERNAL` | `INTERNAL` | our defect; what it was is in the log only |
+//! The one place where errors become statuses (AIP-193): a code, a reason that programs can match, and what to do. The
+//! table of them is in docs/api.md, "Errors".
 //!
 //! Only what may fare better later has a `RetryInfo`. What is too large whatever the state of the server is
 //! `INVALID_ARGUMENT`, as `google.rpc.Code` has it: `FAILED_PRECONDITION` would be for a state that the caller can

@@ -7,13 +7,13 @@ use tonic::{Status, Streaming};
 use tracing::Instrument;
 
 use super::caller::Caller;
-use super::convert::create::{self, Description};
+use super::convert::create;
 use super::convert::input::{Draft, field_of};
 use super::inflight::{Permit, WORKING_COPIES};
 use super::{proto, status};
 use crate::domain::job::Job;
 use crate::domain::{InputName, InvalidInput, Limits, Violation};
-use crate::engine::{self, Engine, JobInput, NewJob};
+use crate::engine::{self, Engine, JobDescription, JobInput, NewJob};
 use crate::telemetry::metrics::{Refusal, refused};
 use proto::create_job_request::Source as Inline;
 use proto::input_data::Data;
@@ -26,7 +26,7 @@ const MESSAGE_TIMEOUT: Duration = Duration::from_secs(60);
 /// A job whose input may still be on its way.
 pub struct Submission {
     tenant: String,
-    description: Description,
+    description: JobDescription,
     input: Source,
     permit: Permit,
     /// What the permit is charged for the input.
@@ -107,15 +107,7 @@ impl Submission {
                 JobInput::Inline(checked.map_err(invalid)?)
             }
         };
-        let mut job = NewJob::new(tenant, input, description.settings);
-        job.job_id = description.job_id;
-        job.request_id = description.request_id;
-        job.labels = description.labels;
-        job.priority = description.priority;
-        job.deadline = description.deadline;
-        job.webhook_url = description.webhook_url;
-        job.trace_parent = trace_parent;
-        Ok(job)
+        Ok(NewJob { tenant, description, input, trace_parent, cancel_on_disconnect: false })
     }
 
     /// Charges that many copies of the input.

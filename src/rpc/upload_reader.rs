@@ -15,7 +15,7 @@ const ZEROS: [u8; 4096] = [0; 4096];
 /// Reads the whole of an upload, in order, for a [`UploadReader`]; ends early where nobody wants more.
 pub async fn feed(upload: &Upload, parts: mpsc::Sender<Result<Bytes, Error>>) {
     let mut at = 0;
-    while at < upload.committed() {
+    while at < upload.committed {
         let part = match upload.read(at).await {
             Ok(part) if part.is_empty() => Err(Error::Internal("bytes of an upload are missing".into())),
             other => other,

@@ -6,7 +6,7 @@ use std::fmt::Debug;
 use sha2::{Digest, Sha256};
 
 use super::Error;
-use crate::domain::job::{DEFAULT_TENANT, JobName, JobState};
+use crate::domain::job::{JobName, JobState};
 
 /// Order of a listing.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
@@ -19,7 +19,7 @@ pub enum Order {
 }
 
 /// Which jobs of a tenant to list.
-#[derive(Debug, Clone, PartialEq, Eq)]
+#[derive(Debug, Clone, Default, PartialEq, Eq)]
 pub struct JobQuery {
     pub tenant: String,
     /// Empty: every state.
@@ -94,19 +94,6 @@ impl Paged for InputQuery {
 
     fn token_after(&self, cursor: &Cursor) -> String {
         cursor.token(&("inputs", &self.tenant))
-    }
-}
-
-impl Default for JobQuery {
-    fn default() -> Self {
-        Self {
-            tenant: DEFAULT_TENANT.into(),
-            states: Vec::new(),
-            labels: BTreeMap::new(),
-            order: Order::default(),
-            page_size: 0,
-            page_token: None,
-        }
     }
 }
 

@@ -1,8 +1,13 @@
 //! What is taken on and what is refused.
 
 use super::*;
+use crate::domain::job::DEFAULT_TENANT;
 use crate::engine::{Error, JobQuery, StoreError};
 use crate::store::TakenId;
+
+fn of_default() -> JobQuery {
+    JobQuery { tenant: DEFAULT_TENANT.into(), ..JobQuery::default() }
+}
 
 #[tokio::test]
 async fn a_full_queue_refuses_at_once_and_takes_on_again() {
@@ -25,7 +30,8 @@ async fn a_full_queue_refuses_at_once_and_takes_on_again() {
 #[tokio::test]
 async fn one_request_is_one_job_however_often_it_is_sent() {
     let test = TestEngine::start(workers(1)).await;
-    let request = |behavior| NewJob { request_id: Some("r-1".into()), ..new_job(behavior) };
+    let description = |behavior| JobDescription { request_id: Some("r-1".into()), ..behaving(behavior) };
+    let request = |behavior| described(description(behavior));
     let calls = (0..20).map(|_| test.engine.submit(request(Behavior::Succeed)));
     let jobs = futures_util::future::join_all(calls).await;
     let name = jobs[0].as_ref().expect("admitted").name.clone();
@@ -39,14 +45,17 @@ async fn one_request_is_one_job_however_often_it_is_sent() {
     assert_eq!(test.engine.submit(traced).await.expect("the same request").name, name);
     for other in [
         request(Behavior::Wait),
-        NewJob { priority: 1, ..request(Behavior::Succeed) },
-        NewJob { job_id: Some("mine".into()), ..request(Behavior::Succeed) },
-        NewJob { deadline: Some(crate::engine::Deadline::After(Duration::from_secs(1))), ..request(Behavior::Succeed) },
+        described(JobDescription { priority: 1, ..description(Behavior::Succeed) }),
+        described(JobDescription { job_id: Some("mine".into()), ..description(Behavior::Succeed) }),
+        described(JobDescription {
+            deadline: Some(crate::engine::Deadline::After(Duration::from_secs(1))),
+            ..description(Behavior::Succeed)
+        }),
     ] {
         assert!(matches!(test.engine.submit(other).await, Err(Error::Store(StoreError::AlreadyExists(_)))));
     }
     assert_eq!(test.solver.calls.load(Ordering::SeqCst), 1);
-    assert_eq!(test.engine.list(&JobQuery::default()).await.expect("lists").items.len(), 1);
+    assert_eq!(test.engine.list(&of_default()).await.expect("lists").items.len(), 1);
 }
 
 #[tokio::test]
@@ -60,12 +69,11 @@ async fn bad_arguments_name_their_field() {
     };
     let mut bad = new_job(Behavior::Succeed);
     bad.tenant = "A".into();
-    bad.job_id = Some("-".into());
-    bad.request_id = Some(String::new());
+    bad.description.job_id = Some("-".into());
     let error = test.engine.submit(bad).await.expect_err("refused");
-    assert_eq!(fields(error), ["tenant", "job_id", "request_id"]);
+    assert_eq!(fields(error), ["tenant", "job_id"]);
     let mut bad = new_job(Behavior::Succeed);
-    bad.settings.alpha = f64::NAN;
+    bad.description.settings.alpha = f64::NAN;
     assert_eq!(fields(test.engine.submit(bad).await.expect_err("refused")), ["job.settings.alpha"]);
     let name = test.submit(Behavior::Succeed).await;
     let last = test.ended(&name).await.last_sequence;
@@ -75,14 +83,14 @@ async fn bad_arguments_name_their_field() {
 #[tokio::test]
 async fn a_page_token_of_no_page_is_refused() {
     let test = TestEngine::start(workers(1)).await;
-    let query = JobQuery { page_token: Some("x".into()), ..JobQuery::default() };
+    let query = JobQuery { page_token: Some("x".into()), ..of_default() };
     assert_eq!(test.engine.list(&query).await, Err(StoreError::PageToken.into()));
 }
 
 #[tokio::test]
 async fn job_ids_are_the_callers_or_made() {
     let test = TestEngine::start(workers(1)).await;
-    let mine = || NewJob { job_id: Some("mine".into()), ..new_job(Behavior::Succeed) };
+    let mine = || described(JobDescription { job_id: Some("mine".into()), ..behaving(Behavior::Succeed) });
     let job = test.engine.submit(mine()).await.expect("admitted");
     assert_eq!(job.name.to_string(), "tenants/default/jobs/mine");
     let taken = test.engine.submit(mine()).await.expect_err("taken");

@@ -8,7 +8,8 @@ use crate::engine::{Deadline, Error};
 #[tokio::test]
 async fn a_job_runs_to_its_result() {
     let test = TestEngine::start(workers(1)).await;
-    let new = NewJob { labels: [("a".to_owned(), "b".to_owned())].into(), ..new_job(Behavior::Succeed) };
+    let new =
+        described(JobDescription { labels: [("a".to_owned(), "b".to_owned())].into(), ..behaving(Behavior::Succeed) });
     let job = test.engine.submit(new).await.expect("admitted");
     assert_eq!((job.state, job.attempt, job.observation_count), (JobState::Queued, 0, 4));
     let mut watch = test.engine.watch(&job.name, 0).await.expect("exists");
@@ -106,9 +107,17 @@ async fn a_cancel_that_another_process_stored_arrives_with_a_heartbeat() {
 async fn a_deadline_ends_a_running_and_a_queued_job() {
     let test = TestEngine::start(workers(1)).await;
     let soon = Some(Deadline::After(Duration::from_millis(200)));
-    let running = test.engine.submit(NewJob { deadline: soon, ..new_job(Behavior::Wait) }).await.expect("admitted");
+    let running = test
+        .engine
+        .submit(described(JobDescription { deadline: soon, ..behaving(Behavior::Wait) }))
+        .await
+        .expect("admitted");
     let long_ago = Some(Deadline::At(SystemTime::UNIX_EPOCH));
-    let queued = test.engine.submit(NewJob { deadline: long_ago, ..new_job(Behavior::Wait) }).await.expect("admitted");
+    let queued = test
+        .engine
+        .submit(described(JobDescription { deadline: long_ago, ..behaving(Behavior::Wait) }))
+        .await
+        .expect("admitted");
     for job in [running, queued] {
         let mut watch = test.engine.watch(&job.name, 0).await.expect("exists");
         let events = rest(&mut watch).await;
@@ -125,7 +134,7 @@ async fn priority_goes_before_age() {
     test.solver.until_waiting(1).await;
     let mut names = vec![first];
     for priority in [0, 7] {
-        let new = NewJob { priority, ..new_job(Behavior::Succeed) };
+        let new = described(JobDescription { priority, ..behaving(Behavior::Succeed) });
         names.push(test.engine.submit(new).await.expect("admitted").name);
     }
     test.solver.release();

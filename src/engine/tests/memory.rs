@@ -42,7 +42,7 @@ async fn a_job_that_takes_more_alone_is_refused() {
 #[tokio::test]
 async fn a_repeated_request_gets_its_job_under_a_smaller_bound_too() {
     let test = TestEngine::start(workers(1)).await;
-    let request = |id: &str| NewJob { request_id: Some(id.into()), ..new_job(Behavior::Succeed) };
+    let request = |id: &str| described(JobDescription { request_id: Some(id.into()), ..behaving(Behavior::Succeed) });
     let first = test.engine.submit(request("first")).await.expect("admitted").name;
     test.ended(&first).await;
     let options = Options { max_solver_bytes: estimated() - 1, ..workers(1) };
@@ -83,7 +83,12 @@ async fn a_job_that_does_not_fit_now_waits_and_heeds_cancel_and_deadline() {
     test.engine.cancel(&cancelled, None).await.expect("exists");
     assert_eq!(test.ended(&cancelled).await.state, JobState::Cancelled);
     let soon = Some(Deadline::After(Duration::from_millis(300)));
-    let due = test.engine.submit(NewJob { deadline: soon, ..new_job(Behavior::Wait) }).await.expect("admitted").name;
+    let due = test
+        .engine
+        .submit(described(JobDescription { deadline: soon, ..behaving(Behavior::Wait) }))
+        .await
+        .expect("admitted")
+        .name;
     assert_eq!(test.ended(&due).await.state, JobState::DeadlineExceeded);
     let last = test.submit(Behavior::Succeed).await;
     runs(&test, &last).await;

@@ -17,7 +17,7 @@ use std::time::Duration;
 
 use tempfile::TempDir;
 
-use super::{Engine, Error, NewJob, Options, Solver};
+use super::{Engine, Error, JobDescription, NewJob, Options, Solver};
 use crate::domain::job::{DEFAULT_TENANT, EventBody, Job, JobEvent, JobName, JobState};
 use crate::domain::{
     Input, Limits, Method, Observer, Progress, RawInput, ReconstructionProgress, Solution, SolveSettings, Stage,
@@ -172,8 +172,25 @@ fn input() -> Input {
     Input::new(raw, &Limits::default(), "test").expect("valid")
 }
 
+/// A job of the default tenant that is described so.
+fn described(description: JobDescription) -> NewJob {
+    NewJob {
+        tenant: DEFAULT_TENANT.into(),
+        description,
+        input: input().into(),
+        trace_parent: None,
+        cancel_on_disconnect: false,
+    }
+}
+
+/// What makes the solver behave so.
+fn behaving(behavior: Behavior) -> JobDescription {
+    let settings = SolveSettings { seed: behavior as u64, ..SolveSettings::default() };
+    JobDescription { settings, ..JobDescription::default() }
+}
+
 fn new_job(behavior: Behavior) -> NewJob {
-    NewJob::new(DEFAULT_TENANT, input(), SolveSettings { seed: behavior as u64, ..SolveSettings::default() })
+    described(behaving(behavior))
 }
 
 impl Engine {

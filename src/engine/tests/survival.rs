@@ -228,7 +228,7 @@ async fn a_job_that_lost_attempts_waits_until_it_is_alone_and_others_wait_for_it
     let running = test.submit(Behavior::Wait).await;
     test.solver.until_waiting(1).await;
     test.engine.set_paused(true).await.expect("pauses");
-    let suspect = NewJob { priority: 9, ..new_job(Behavior::Wait) };
+    let suspect = described(JobDescription { priority: 9, ..behaving(Behavior::Wait) });
     let suspect = test.engine.submit(suspect).await.expect("admitted").name;
     test.store.execute("UPDATE jobs SET lost_attempts = 2 WHERE priority = 9").await;
     let other = test.submit(Behavior::Succeed).await;
@@ -260,7 +260,7 @@ async fn a_suspect_that_waits_is_cancelled_and_left_by_a_drain_as_any_job_that_w
         let running = test.submit(Behavior::Wait).await;
         test.solver.until_waiting(1).await;
         test.engine.set_paused(true).await.expect("pauses");
-        let suspect = NewJob { priority: 9, ..new_job(Behavior::Wait) };
+        let suspect = described(JobDescription { priority: 9, ..behaving(Behavior::Wait) });
         let suspect = test.engine.submit(suspect).await.expect("admitted").name;
         test.store.execute("UPDATE jobs SET lost_attempts = 2 WHERE priority = 9").await;
         test.engine.set_paused(false).await.expect("resumes");

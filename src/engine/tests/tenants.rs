@@ -12,8 +12,11 @@ fn of(tenant: &str, behavior: Behavior) -> NewJob {
 async fn place_of_the_single_job(short_job: Duration, second_in_hand: bool) -> u32 {
     let test = TestEngine::start(Options { short_job, ..workers(1) }).await;
     let mut many = vec![of("a", Behavior::Wait)];
-    many.extend((0..4).map(|_| NewJob { priority: 9, ..of("a", Behavior::Succeed) }));
-    many[0].priority = 10;
+    many.extend((0..4).map(|_| NewJob {
+        tenant: "a".into(),
+        ..described(JobDescription { priority: 9, ..behaving(Behavior::Succeed) })
+    }));
+    many[0].description.priority = 10;
     let many = test.engine.submit_batch(many).await.expect("admitted");
     test.solver.until_waiting(1).await;
     if second_in_hand {

@@ -4,8 +4,8 @@ use std::collections::BTreeMap;
 
 use super::{given, positive_duration, settings, time_from_wire};
 use crate::domain::error::Violations;
-use crate::domain::{InvalidInput, SolveSettings, Violation, Webhook};
-use crate::engine::Deadline;
+use crate::domain::{InvalidInput, Violation, Webhook};
+use crate::engine::{Deadline, JobDescription};
 use crate::rpc::proto;
 use proto::job::Deadline as WireDeadline;
 
@@ -19,23 +19,11 @@ pub const MAX_PRIORITY: i32 = 1_000;
 /// Longest request id: a UUID has 36 characters.
 const MAX_REQUEST_ID: usize = 128;
 
-/// A job's description, checked.
-#[derive(Debug, Clone, PartialEq)]
-pub struct Description {
-    pub job_id: Option<String>,
-    pub request_id: Option<String>,
-    pub settings: SolveSettings,
-    pub labels: BTreeMap<String, String>,
-    pub priority: i32,
-    pub deadline: Option<Deadline>,
-    pub webhook_url: Option<String>,
-}
-
 /// Reads and checks everything but parent and input. Fields of the job that are the server's are ignored.
 ///
 /// # Errors
 /// Every violation found.
-pub fn from_wire(job_id: String, request_id: String, job: Option<proto::Job>) -> Result<Description, InvalidInput> {
+pub fn from_wire(job_id: String, request_id: String, job: Option<proto::Job>) -> Result<JobDescription, InvalidInput> {
     let job = job.unwrap_or_default();
     let settings = settings::from_wire(job.settings)?;
     let deadline = job.deadline.map(deadline_from_wire).transpose()?;
@@ -53,7 +41,7 @@ pub fn from_wire(job_id: String, request_id: String, job: Option<proto::Job>) ->
         found.push(Violation::of("job.webhook.url", error));
     }
     found.into_result()?;
-    Ok(Description {
+    Ok(JobDescription {
         job_id: given(job_id),
         request_id: given(request_id),
         settings,
@@ -113,7 +101,7 @@ mod tests {
 
     use super::*;
 
-    fn described(job: proto::Job) -> Result<Description, Vec<String>> {
+    fn described(job: proto::Job) -> Result<JobDescription, Vec<String>> {
         from_wire(String::new(), "r-1".into(), Some(job))
             .map_err(|error| error.violations().iter().map(Violation::path).collect())
     }
@@ -125,7 +113,7 @@ mod tests {
     #[test]
     fn an_empty_description_is_all_defaults() {
         let description = from_wire(String::new(), String::new(), None).expect("valid");
-        assert_eq!(description.settings, SolveSettings::default());
+        assert_eq!(description.settings, crate::domain::SolveSettings::default());
         assert_eq!((description.job_id, description.request_id, description.deadline), (None, None, None));
     }
 

@@ -108,7 +108,7 @@ fn terminal(event: &JobEvent) -> Option<JobState> {
 /// The end is one that the job can come to, and a result is its own.
 async fn came_right(store: &Store, job: &Job, is_disturbed: bool) -> Result<(), String> {
     let number = job.name.job.trim_start_matches("job-").parse().map_err(|_| "a foreign job".to_owned())?;
-    let behavior = JobBehavior::of(request(number).settings.seed);
+    let behavior = JobBehavior::of(request(number).description.settings.seed);
     let reason = job.failure.as_ref().map(|failure| failure.reason.as_str());
     match job.state {
         JobState::Succeeded => {

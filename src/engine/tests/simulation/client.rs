@@ -11,7 +11,7 @@ use super::server::Server;
 use crate::domain::SolveSettings;
 use crate::domain::job::{EventBody, JobName, JobState};
 use crate::engine::tests::input;
-use crate::engine::{Engine, Error, NewJob, StoreError};
+use crate::engine::{Engine, Error, JobDescription, NewJob, StoreError};
 
 /// Jobs that clients ask for in one simulation at most.
 const MOST_REQUESTS: u64 = 24;
@@ -142,11 +142,20 @@ impl Clients {
 pub(super) fn request(number: u64) -> NewJob {
     let seed = ChaCha8Rng::seed_from_u64(number).random_range(0..1_000_000);
     let settings = SolveSettings { seed, ..SolveSettings::default() };
-    let mut new = NewJob::new(format!("tenant-{}", number % 3), input(), settings);
-    new.request_id = Some(format!("request-{number}"));
-    new.job_id = Some(format!("job-{number}"));
-    new.priority = (seed / 1_000 % 3) as i32;
-    new
+    let description = JobDescription {
+        request_id: Some(format!("request-{number}")),
+        job_id: Some(format!("job-{number}")),
+        priority: (seed / 1_000 % 3) as i32,
+        settings,
+        ..JobDescription::default()
+    };
+    NewJob {
+        tenant: format!("tenant-{}", number % 3),
+        description,
+        input: input().into(),
+        trace_parent: None,
+        cancel_on_disconnect: false,
+    }
 }
 
 /// What may be answered by a server whose store misbehaves.
