@@ -126,8 +126,8 @@ fn of_status(server: &str, status: &Status, answered: bool) -> Error {
     match status.code() {
         Code::Unavailable => Unavailable.error(format!("{server}: {message}")),
         Code::ResourceExhausted => {
-            // Of a rate the message itself tells the time.
-            let delay = retry_delay(status).filter(|_| rate_limit_wait(status).is_none());
+            // What is waited for says so itself.
+            let delay = retry_delay(status).filter(|_| told_wait(status).is_none());
             let hint = delay.map(|delay| format!("; try again in {} s", tenths(delay))).unwrap_or_default();
             Unavailable.error(format!("{server}: {message}{hint}"))
         }
@@ -160,9 +160,10 @@ fn tenths(delay: Duration) -> f64 {
     (delay.as_secs_f64() * 10.0).ceil() / 10.0
 }
 
-/// After what time a call passes that was refused because of a rate; nothing of it was carried out.
-pub(super) fn rate_limit_wait(status: &Status) -> Option<Duration> {
-    retry_delay(status).filter(|_| reason(status).as_deref() == Some("RATE_LIMITED"))
+/// After what time a call may pass that was refused because of a rate, or because other calls had the server's memory;
+/// nothing of it was carried out.
+pub(super) fn told_wait(status: &Status) -> Option<Duration> {
+    retry_delay(status).filter(|_| matches!(reason(status).as_deref(), Some("RATE_LIMITED" | "MEMORY")))
 }
 
 /// Whether what was sent is more by itself than the server has room for.
@@ -306,14 +307,14 @@ mod tests {
         let told = |status: &Status| Error::from_status("http://a", status, true).to_string();
         let wait = Duration::from_nanos(146_655_954);
         let limited = status::rate_limited(RateBound::Calls, wait);
-        assert_eq!(rate_limit_wait(&limited), Some(wait));
+        assert_eq!(told_wait(&limited), Some(wait));
         let words = told(&limited);
         assert!(words.ends_with("; come back in 0.147 s") && !words.contains("try again"), "{words}");
         let details = ErrorDetails::with_retry_info(Some(Duration::from_millis(1_234)));
         let full = Status::with_error_details(Code::ResourceExhausted, "full", details);
-        assert_eq!((told(&full).as_str(), rate_limit_wait(&full)), ("http://a: full; try again in 1.3 s", None));
+        assert_eq!((told(&full).as_str(), told_wait(&full)), ("http://a: full; try again in 1.3 s", None));
         let memory = status::memory_full(1);
-        assert!(rate_limit_wait(&memory).is_none() && retry_delay(&memory).is_some());
+        assert_eq!(told_wait(&memory), retry_delay(&memory));
     }
 
     #[test]

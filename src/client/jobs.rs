@@ -88,7 +88,7 @@ impl Client {
         }
     }
 
-    /// An input as a request has it: within the message where there is `room` for it, which it takes, uploaded elsewhere.
+    /// An input as a request has it: in the message where there is `room` for it, which it takes; uploaded elsewhere.
     pub(super) async fn source(&mut self, input: JobInput, room: &mut usize) -> Result<Source, Error> {
         let name = match input {
             JobInput::Data(data) => match room.checked_sub(data.encoded_len()) {

@@ -20,7 +20,8 @@
 //! Where the connection breaks or the server goes down, these go on for up to [`MAX_WAIT`], with pauses that grow from
 //! a tenth of a second to five seconds: a creation under its request id, a watch after its last event, a result after
 //! its last byte, an upload after what the server has. Other calls fail at once with [`ErrorKind::Unavailable`]. Every
-//! call is repeated where a rate refused it, after the time that the server tells. [`Client::on_wait`] hears of waits.
+//! call is repeated where a rate or the server's memory refused it, after the time that the server tells.
+//! [`Client::on_wait`] hears of waits.
 //!
 //! # Dependence
 //!
@@ -72,7 +73,8 @@ const CONNECT_TIMEOUT: Duration = Duration::from_secs(5);
 /// A silent connection is asked this often whether it lives, so that a watch of a long job notices a lost server.
 const KEEPALIVE: Duration = Duration::from_secs(20);
 
-/// How long a client goes on where a connection breaks or a rate refuses a call, tries and pauses together.
+/// How long a client goes on where a connection breaks, or a rate or the server's memory refuses a call, tries and
+/// pauses together.
 pub const MAX_WAIT: Duration = Backoff::TOTAL;
 
 /// A rate that lets the call pass sooner than this is waited for without a word: a list of many pages may meet it at
@@ -182,7 +184,8 @@ impl Client {
         Error::from_status(&self.server, &status, self.answered.load(Ordering::Relaxed))
     }
 
-    /// Makes a call, and makes it again where a rate of calls or jobs refused it. For any other trouble it does not wait.
+    /// Makes a call, and makes it again where a rate or the server's memory refused it. For any other trouble it does
+    /// not wait.
     async fn call<R: Clone, T, F>(&self, request: R, send: impl Fn(Self, R) -> F) -> Result<T, Error>
     where
         F: Future<Output = Result<Response<T>, Status>>,
@@ -191,7 +194,7 @@ impl Client {
         loop {
             match backoff.within(send(self.clone(), request.clone())).await {
                 Ok(answer) => return Ok(answer.into_inner()),
-                Err(status) if error::rate_limit_wait(&status).is_some() => self.pause(&mut backoff, status).await?,
+                Err(status) if error::told_wait(&status).is_some() => self.pause(&mut backoff, status).await?,
                 Err(status) => return Err(self.error(status)),
             }
         }
@@ -199,7 +202,7 @@ impl Client {
 
     /// Waits before another try, or gives up: for good reason, or after too many. Says so once each trouble.
     async fn pause(&self, backoff: &mut Backoff, status: Status) -> Result<(), Error> {
-        let wait = error::rate_limit_wait(&status);
+        let wait = error::told_wait(&status);
         let transient = wait.is_some() || error::is_transient(&status);
         let first = transient && backoff.failed(&status);
         if first
@@ -214,7 +217,7 @@ impl Client {
         if transient && backoff.pause(wait.unwrap_or_default()).await {
             return Ok(());
         }
-        // A rate says the same at every try, with another time.
+        // A refusal says the same at every try, with another time.
         let before = backoff.first().filter(|_| wait.is_none()).map(|status| self.error(status.clone()));
         Err(before.map_or(error.clone(), |before| error.begun_with(&before)))
     }
