@@ -55,6 +55,14 @@ impl Ended {
         }
     }
 
+    /// What it is worth, see [`worth`].
+    pub fn worth(&self, problem: &Problem) -> f64 {
+        match self {
+            Ended::Extended(extended) => worth(extended.evidence(problem), extended.is_calibrated(problem)),
+            Ended::Block(attempt) => attempt.as_ref().map_or(0.0, |attempt| attempt_worth(attempt, problem)),
+        }
+    }
+
     /// What it began from.
     pub fn seed(self) -> Option<Attempt> {
         match self {
@@ -62,6 +70,18 @@ impl Ended {
             Ended::Block(attempt) => attempt.map(|attempt| *attempt),
         }
     }
+}
+
+/// What an answer is worth beside others: its evidence, not below 0, and with a calibration
+/// [`ExtensionOptions::worth_of_calibration`] times that.
+fn worth(evidence: f64, is_calibrated: bool) -> f64 {
+    let factor = if is_calibrated { ExtensionOptions::DEFAULT.worth_of_calibration } else { 1.0 };
+    factor * evidence.max(0.0)
+}
+
+/// The same of an attempt.
+pub fn attempt_worth(attempt: &Attempt, problem: &Problem) -> f64 {
+    worth(attempt.evidence(problem), attempt.is_calibrated())
 }
 
 /// Extends an attempt metrically where it has a metric reconstruction and that stands.

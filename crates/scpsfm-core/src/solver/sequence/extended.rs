@@ -102,11 +102,17 @@ impl Extended {
     /// As [`evidence`].
     pub fn evidence(&self, problem: &Problem) -> f64 {
         let model = &self.model;
-        let verified = adjust::verified(model);
-        let observations = verified.iter().filter_map(|&track| model.landmarks[track]).map(|point| point.support).sum();
+        let (verified, observations) = self.verified();
         let (of_view, of_point) = MetricReconstruction::unknowns_each(model.has_common_centre);
-        let unknowns = of_view * model.registered().len() + of_point * verified.len();
+        let unknowns = of_view * model.registered().len() + of_point * verified;
         evidence(observations, unknowns, model.noise, problem.outlier_density)
+    }
+
+    /// Points that geometry verifies, and the observations that agree with them.
+    fn verified(&self) -> (usize, usize) {
+        let verified = adjust::verified(&self.model);
+        let points = verified.iter().filter_map(|&track| self.model.landmarks[track]);
+        (verified.len(), points.map(|point| point.support).sum())
     }
 
     /// Whether nothing says that projective cameras would fit better.
@@ -122,11 +128,13 @@ impl Extended {
             && self.calibrations.iter().any(|outcome| outcome.metric.is_some())
     }
 
-    /// Whether nothing is to be gained by extending without a calibration: it has one, or most views hold together so
-    /// precisely that wrong observations do not, and fit as well as projective cameras.
+    /// Whether nothing is to be gained by extending without a calibration: it holds most views and explains enough, and
+    /// has a calibration, or is so precise that wrong observations are not, and fits as well as projective cameras.
     pub fn is_settled(&self, problem: &Problem) -> bool {
         let is_precise = self.model.noise <= NoiseOptions::DEFAULT.initial;
-        self.is_calibrated(problem) || is_precise && self.holds_most_views() && self.fits()
+        let (_, explained) = self.verified();
+        let explains_enough = explained as f64 >= OPTIONS.enough_explained * problem.input.observation_count() as f64;
+        self.holds_most_views() && explains_enough && (self.is_calibrated(problem) || is_precise && self.fits())
     }
 
     pub fn holds_most_views(&self) -> bool {

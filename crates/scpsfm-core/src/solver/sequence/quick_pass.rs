@@ -3,7 +3,7 @@
 use std::ops::ControlFlow;
 
 use super::blocks::Blocks;
-use super::ended::{Ended, metric_of};
+use super::ended::{Ended, attempt_worth, metric_of};
 use super::options::ExtensionOptions;
 use super::starts::{QUICK_SEED, Start, by_projective_extension, extend_projectively, stands, starts};
 use super::triplets::Pairs;
@@ -36,7 +36,8 @@ impl QuickPass {
         }
     }
 
-    /// What else is tried where the quick pass has neither a calibration nor a precise reconstruction of most views.
+    /// What else is tried where the quick pass has neither a calibration nor a precise reconstruction of most views. A
+    /// calibration of few views stands unless what is found is worth more.
     ///
     /// In order of cost: what it found and small subsets of the blocks, extended projectively and calibrated then; where
     /// that is not METRIC and holds less than half of the views, triplets in the same way. Only where none of these
@@ -45,30 +46,38 @@ impl QuickPass {
     pub fn finish(self, problem: &Problem, recorder: &mut Recorder) -> Result<Ended, Error> {
         let Self { blocks, result } = self;
         let is_quick = blocks.begin_quickly(problem);
-        let first = match result {
+        // A calibration of few views, than which another answer may be worth more.
+        let (part, first) = match result {
             ControlFlow::Break(ended) => return Ok(ended),
-            ControlFlow::Continue(ended) => ended.seed(),
+            ControlFlow::Continue(ended) if ended.calibrated_extension(problem).is_some() => (Some(ended), None),
+            ControlFlow::Continue(ended) => (None, ended.seed()),
         };
         let subsets = view_selection::subsets(&blocks.sets);
-        let first_subsets = if blocks.is_whole { ExtensionOptions::DEFAULT.first_subsets } else { subsets.len() };
+        let is_short = blocks.is_whole || part.is_some();
+        let first_subsets = if is_short { ExtensionOptions::DEFAULT.first_subsets } else { subsets.len() };
         let cheap = first_subsets.min(subsets.len());
         let (cheap, rest) = subsets.split_at(cheap);
         // Nothing else is searched of a whole input with depths: what it has found stands.
         let mut best = by_projective_extension(problem, None, starts(first, !is_quick, cheap), recorder)?;
         let leaves_most = |best: &Attempt| !best.is_good() && best.leaves_most_views(problem);
-        if !blocks.is_whole && best.as_ref().is_none_or(leaves_most) {
+        if !blocks.is_whole && part.is_none() && best.as_ref().is_none_or(leaves_most) {
             let triplets = view_selection::triplets(problem, &vec![true; problem.views()]);
             let starts = triplets.into_iter().map(|views| Start::Views(SeedViews::Triplet(views))).collect();
             best = by_projective_extension(problem, best, starts, recorder)?;
         }
-        if is_quick && !stands(&best) {
+        if is_quick && part.is_none() && !stands(&best) {
             let first = match blocks.by_calibration(problem, false, recorder)? {
                 ControlFlow::Break(ended) => return Ok(ended),
+                ControlFlow::Continue(ended) if ended.calibrated_extension(problem).is_some() => return Ok(ended),
                 ControlFlow::Continue(ended) => ended.seed(),
             };
             best = by_projective_extension(problem, None, starts(first, false, rest), recorder)?;
         }
-        best.map_or(Ok(Ended::Block(None)), |best| metric_of(problem, best, recorder))
+        let part_worth = part.as_ref().map_or(f64::NEG_INFINITY, |part| part.worth(problem));
+        let found = best.filter(|best| attempt_worth(best, problem) > part_worth);
+        let found = found.map(|best| metric_of(problem, best, recorder)).transpose()?;
+        let found = found.filter(|found| found.worth(problem) > part_worth);
+        Ok(found.or(part).unwrap_or(Ended::Block(None)))
     }
 }
 

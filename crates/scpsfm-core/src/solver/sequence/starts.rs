@@ -1,5 +1,6 @@
 //! Seeds that are extended to all views without a calibration, and calibrated then.
 
+use super::ended::attempt_worth;
 use super::options::{ExtensionOptions, GrowthOptions};
 use super::projective_growth;
 use super::triplets::Pairs;
@@ -74,8 +75,9 @@ pub fn by_projective_extension(
             continue;
         }
         attempt::calibrate(problem, &mut attempt, &[], recorder)?;
-        if best.as_ref().is_none_or(|best| outweighs(&attempt, best) || worth(&attempt, problem) > worth(best, problem))
-        {
+        if best.as_ref().is_none_or(|best| {
+            outweighs(&attempt, best) || attempt_worth(&attempt, problem) > attempt_worth(best, problem)
+        }) {
             best = Some(attempt);
         }
         if best.as_ref().is_some_and(Attempt::is_good) {
@@ -83,13 +85,6 @@ pub fn by_projective_extension(
         }
     }
     Ok(best.or(unsolved))
-}
-
-/// What an attempt is worth: its evidence, not below 0, and with a calibration
-/// [`ExtensionOptions::worth_of_calibration`] times that.
-fn worth(attempt: &Attempt, problem: &Problem) -> f64 {
-    let factor = if attempt.is_calibrated() { ExtensionOptions::DEFAULT.worth_of_calibration } else { 1.0 };
-    factor * attempt.evidence(problem).max(0.0)
 }
 
 /// Whether an attempt is verified by depths, and worth more than another that is not, see [`Attempt::outweighs`].

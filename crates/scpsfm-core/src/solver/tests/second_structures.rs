@@ -246,6 +246,17 @@ fn what_has_more_tracks_is_the_scene() {
     assert!(posed > 0, "no body has poses");
 }
 
+/// The camera only turns and zooms, which gives no calibration here. The body gives one, of half of the views and an
+/// eighth of the tracks.
+#[test]
+fn a_calibration_of_few_tracks_does_not_stand_before_the_scene() {
+    let (input, scene) = photographed(800_073, WrongKind::SecondBody);
+    let solution = solved(&input, &SolveSettings { focal_per_view: true, ..SolveSettings::default() });
+    let kept = agreement(&solution.observations.inlier, &scene.truth.observation_right);
+    let wanted = agreement(&solution.observations.inlier, &scene.truth.verifiable(&scene.input.track));
+    assert!(kept.precision > 0.95 && wanted.recall > 0.9, "{kept:?} {wanted:?}");
+}
+
 /// Pinholes fit a part of what a strong lens shows, and another part moves alike until the lens is known.
 #[test]
 fn tracks_that_a_lens_brings_in_are_no_second_structure() {
