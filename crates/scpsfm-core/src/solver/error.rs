@@ -3,6 +3,9 @@
 use crate::domain::{StopReason, StopToken};
 
 /// Why a solve ended without a solution. A scene that cannot be solved is a solution, not an error.
+///
+/// What takes a problem or a stop token and can end early ends with [`Error::Stopped`]; what searches blocks may end
+/// with [`Error::Internal`], too.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 pub enum Error {
     /// The stop token asked for it.

@@ -19,8 +19,12 @@ options! {
         /// Spread of the points of a view across the line that fits them best, in units of the noise, from which they
         /// lie off it. Points on a line are spread by one; the noise is known to a factor of two.
         least_across: f64 = 4.0,
-        /// Share of the points that is asked. A few that lie off the line of all others make no scene of it.
-        asked_share: f64 = 0.9,
+        /// Share of the points of a view that the line is fitted to, in views of ten points or more. A few points off
+        /// the line of all others are no structure.
+        fitted_share: f64 = 0.9,
+        /// The line is fitted again while that lowers the spread to less than this share. The spread of points that
+        /// are on no line settles at the third fit; that of others falls at each as points beside the line leave.
+        settled: f64 = 0.95,
     }
 }
 
@@ -197,10 +201,11 @@ fn frame_with_plane_at_infinity(plane: &Vector4<f64>) -> Option<Matrix4<f64>> {
         None => Matrix4::identity(),
     })
 }
+
 /// Root mean square distance of most points of a view from the line that fits those best (least trimmed squares,
 /// Rousseeuw 1984); `None` without points.
 fn spread_across(mut points: Vec<Vector2<f64>>) -> Option<f64> {
-    let asked = (OPTIONS.asked_share * points.len() as f64).ceil() as usize;
+    let fitted = (OPTIONS.fitted_share * points.len() as f64).ceil() as usize;
     let (mut count, mut before) = (points.len(), f64::INFINITY);
     loop {
         let near = points.get(..count).filter(|near| !near.is_empty())?;
@@ -210,14 +215,14 @@ fn spread_across(mut points: Vec<Vector2<f64>>) -> Option<f64> {
         let across = axes.eigenvalues.imin();
         let spread = axes.eigenvalues[across].max(0.0).sqrt();
         // Points that lie off the line of the others turn the first fits, and less each time.
-        if spread >= 0.5 * before {
+        if spread >= OPTIONS.settled * before {
             return Some(spread);
         }
         let normal = axes.eigenvectors.column(across).into_owned();
         let nearer = |a: &Vector2<f64>, b: &Vector2<f64>| {
             f64::total_cmp(&normal.dot(&(a - mean)).abs(), &normal.dot(&(b - mean)).abs())
         };
-        points.select_nth_unstable_by(asked - 1, nearer);
-        (count, before) = (asked, spread);
+        points.select_nth_unstable_by(fitted - 1, nearer);
+        (count, before) = (fitted, spread);
     }
 }

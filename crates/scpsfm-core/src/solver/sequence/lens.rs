@@ -27,7 +27,7 @@ options! {
     /// Which lenses are sampled, and when one is searched behind.
     struct LensSearchOptions {
         /// Focal lengths of the equidistant fisheyes, in units of the longer image side. From 85 degrees off the axis
-        /// at the corner of a 4:3 image to where the corner is bent by a tenth of its distance, which pinhole seeds
+        /// at the corner of a 4:3 image to where the corner is bent by an eighth of its distance, which pinhole seeds
         /// take for depth where a camera only turns. From one to the next the distortion changes by a quarter.
         focals: [f64; 8] = [0.42, 0.47, 0.53, 0.6, 0.68, 0.78, 0.88, 1.0],
         /// Factors by which the best of them is moved to either side, one after the other. Half, a quarter and an
