@@ -2,6 +2,7 @@
 
 use std::cell::Cell;
 use std::io::IsTerminal;
+use std::sync::{Mutex, MutexGuard, PoisonError};
 use std::time::{Duration, Instant};
 
 use indicatif::{ProgressBar, ProgressStyle};
@@ -106,38 +107,45 @@ impl ProgressView {
 
 /// Shows how many bytes of a transfer are done.
 pub struct TransferView {
-    bar: Option<ProgressBar>,
+    is_shown: bool,
+    bar: Mutex<Option<ProgressBar>>,
 }
 
 impl TransferView {
     /// A bar when stderr is a terminal, nothing elsewhere: a transfer is short, and its end says that it was done.
     pub fn new(quiet: bool) -> Self {
-        let bar = (!quiet && std::io::stderr().is_terminal()).then(|| {
-            let bar = ProgressBar::no_length();
-            if let Ok(style) = ProgressStyle::with_template(
-                "{bytes:>10} of {total_bytes} [{bar:24}] {percent:>3}% {bytes_per_sec}, {eta}",
-            ) {
-                bar.set_style(style.progress_chars("=> "));
-            }
-            bar
-        });
-        Self { bar }
+        Self { is_shown: !quiet && std::io::stderr().is_terminal(), bar: Mutex::default() }
     }
 
     /// So many bytes of the total are done.
-    pub fn show(&mut self, bytes: u64, total: u64) {
-        if let Some(bar) = &self.bar {
-            bar.set_length(total);
-            bar.set_position(bytes);
+    pub fn show(&self, bytes: u64, total: u64) {
+        if self.is_shown && bytes < total {
+            self.bar().get_or_insert_with(|| transfer_bar(total)).set_position(bytes);
+        } else {
+            self.finish();
         }
     }
 
     /// Takes the bar away.
-    pub fn finish(&mut self) {
-        if let Some(bar) = self.bar.take() {
+    pub fn finish(&self) {
+        if let Some(bar) = self.bar().take() {
             bar.finish_and_clear();
         }
     }
+
+    fn bar(&self) -> MutexGuard<'_, Option<ProgressBar>> {
+        self.bar.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+}
+
+fn transfer_bar(total: u64) -> ProgressBar {
+    let bar = ProgressBar::new(total);
+    if let Ok(style) =
+        ProgressStyle::with_template("{bytes:>10} of {total_bytes} [{bar:24}] {percent:>3}% {bytes_per_sec}, {eta}")
+    {
+        bar.set_style(style.progress_chars("=> "));
+    }
+    bar
 }
 
 impl Drop for TransferView {

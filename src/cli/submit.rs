@@ -2,6 +2,7 @@
 
 use std::collections::BTreeMap;
 use std::path::PathBuf;
+use std::sync::Arc;
 use std::time::Duration;
 
 use clap::builder::NonEmptyStringValueParser;
@@ -29,7 +30,8 @@ Examples:
 /// Leave jobs with a server
 ///
 /// Prints each job's name. The jobs go on without this command, and over restarts of the server. Of several inputs each
-/// is a job of its own, with the same settings; all of them are stored, or none. Large inputs are uploaded first.
+/// is a job of its own, with the same settings; all of them are stored, or none. An input that is larger than the
+/// server's messages is uploaded first, and stays with the server as by `scpsfm upload`.
 #[derive(Debug, clap::Args)]
 #[command(after_help = EXAMPLES, after_long_help = format!("{EXAMPLES}\n\n{}", super::exit::HELP))]
 pub struct Args {
@@ -118,20 +120,20 @@ pub async fn run(args: Args) -> Result<Exit, Failure> {
         time_limit: args.time_limit,
         webhook_url: args.webhook_url,
     };
-    let mut inputs = Vec::new();
-    for input in &read {
-        let mut view = TransferView::new(false);
-        let sent = client.upload_large(input, &mut |bytes, total| view.show(bytes, total)).await;
-        inputs.push(sent.map_err(|error| remote::at_lines(error, input))?);
-    }
+    let view = Arc::new(TransferView::new(false));
+    let shown = Arc::clone(&view);
+    client.on_upload(move |bytes, total| shown.show(bytes, total));
+    let mut inputs: Vec<JobInput> = read.iter().map(JobInput::from).collect();
     inputs.extend(named.into_iter().map(JobInput::Uploaded));
     if several {
         let created = client.create_batch(inputs, &settings, &options).await;
+        view.finish();
         let jobs = created.map_err(|error| remote::at_lines_of(error, &read))?;
         return jobs.iter().try_for_each(|job| print(&job.name.to_string())).map(|()| Exit::Done);
     }
     let input = inputs.pop().ok_or_else(nothing)?;
     let created = client.create(input, &settings, options).await;
+    view.finish();
     let job = created.map_err(|error| match read.first() {
         Some(input) => remote::at_lines(error, input),
         None => error.into(),

@@ -36,7 +36,7 @@ pub async fn run(args: Args) -> Result<Exit, Failure> {
     tell_notes(&input);
     let mut client = args.server.connect().await?;
     let encoded = EncodedInput::new(&input);
-    let mut view = TransferView::new(args.quiet);
+    let view = TransferView::new(args.quiet);
     let uploaded = client.upload(&encoded, &mut |bytes| view.show(bytes, encoded.len())).await;
     view.finish();
     let name = uploaded.map_err(|error| remote::at_lines(error, &input))?;

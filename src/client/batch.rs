@@ -1,15 +1,17 @@
 //! Several jobs in one call, all or none.
 
+use prost::Message;
+
 use super::backoff::Backoff;
-use super::jobs::{JobOptions, MAX_INLINE_BYTES, create_request};
+use super::jobs::{BESIDE_BYTES, JobOptions, create_request};
 use super::{Client, Error, JobInput};
 use crate::domain::job::Job;
 use crate::domain::{SolveSettings, Violation};
 use crate::rpc::{convert, proto};
 
 impl Client {
-    /// Creates a job of each input, in their order, all of them or none. What together is too large for a call is
-    /// [uploaded](Self::upload) first.
+    /// Creates a job of each input, in their order, all of them or none. Inputs that no longer fit into the message are
+    /// uploaded first, as by [`create`](Self::create).
     ///
     /// A request id that is given stands, with the number of the job after it, for each of them.
     ///
@@ -21,12 +23,17 @@ impl Client {
         settings: &SolveSettings,
         options: &JobOptions,
     ) -> Result<Vec<Job>, Error> {
-        let (mut requests, mut room) = (Vec::new(), MAX_INLINE_BYTES);
-        for (index, input) in inputs.into_iter().enumerate() {
-            let source = self.source(input, &mut room).await.map_err(|error| of_request(error, index))?;
-            let request_id = options.request_id.as_ref().map(|id| format!("{id}-{}", index + 1));
-            let options = JobOptions { request_id, ..options.clone() };
-            requests.push(create_request(self.parent(), source, settings, options));
+        let inputs: Vec<JobInput> = inputs.into_iter().collect();
+        let mut requests = Vec::new();
+        for number in 1..=inputs.len() {
+            let request_id = options.request_id.as_ref().map(|id| format!("{id}-{number}"));
+            requests.push(create_request(self.parent(), settings, JobOptions { request_id, ..options.clone() }));
+        }
+        let beside = requests.iter().map(|request| request.encoded_len() + BESIDE_BYTES).sum();
+        let mut room = self.room_for_inputs(beside, inputs.iter().map(JobInput::encoded_len).sum()).await?;
+        for (index, (input, request)) in inputs.into_iter().zip(&mut requests).enumerate() {
+            let source = self.source(input, &mut room).await;
+            request.source = Some(source.map_err(|error| of_request(error, index))?);
         }
         let request = proto::BatchCreateJobsRequest { parent: self.parent(), requests };
         let mut backoff = Backoff::default();
@@ -43,8 +50,9 @@ impl Client {
     }
 }
 
-/// The error of an upload, whose fields name its request as those of the call itself do.
+/// The error of an upload, which names its request as those of the call itself do.
 fn of_request(mut error: Error, index: usize) -> Error {
+    error.message.insert_str(0, &format!("requests[{index}]: "));
     for Violation { field, .. } in &mut error.violations {
         *field = format!("requests[{index}].{field}");
     }

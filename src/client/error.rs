@@ -126,8 +126,8 @@ fn of_status(server: &str, status: &Status, answered: bool) -> Error {
     match status.code() {
         Code::Unavailable => Unavailable.error(format!("{server}: {message}")),
         Code::ResourceExhausted => {
-            // What is waited for says so itself.
-            let delay = retry_delay(status).filter(|_| told_wait(status).is_none());
+            // Of a rate the message itself tells the time.
+            let delay = retry_delay(status).filter(|_| reason(status).as_deref() != Some("RATE_LIMITED"));
             let hint = delay.map(|delay| format!("; try again in {} s", tenths(delay))).unwrap_or_default();
             Unavailable.error(format!("{server}: {message}{hint}"))
         }
@@ -161,8 +161,8 @@ fn tenths(delay: Duration) -> f64 {
 }
 
 /// After what time a call may pass that was refused because of a rate, or because other calls had the server's memory;
-/// nothing of it was carried out.
-pub(super) fn told_wait(status: &Status) -> Option<Duration> {
+/// nothing was stored of it but chunks of an upload.
+pub(super) fn retry_after(status: &Status) -> Option<Duration> {
     retry_delay(status).filter(|_| matches!(reason(status).as_deref(), Some("RATE_LIMITED" | "MEMORY")))
 }
 
@@ -231,8 +231,13 @@ fn violations(status: &Status) -> Vec<Violation> {
     fields.into_iter().map(|found| violation(&found.field, found.description)).collect()
 }
 
-/// Reads `track_set.xs[17]` or `track_set.views[2].name` back into its parts.
+/// Reads `track_set.xs[17]` or `track_set.views[2].name` back into its parts. The request of a batch that a field is in
+/// stays a part of the field: `requests[3].track_set.xs`.
 fn violation(path: &str, description: String) -> Violation {
+    if let Some((request, rest)) = path.split_once("].").filter(|(request, _)| request.starts_with("requests[")) {
+        let found = violation(rest, description);
+        return Violation { field: format!("{request}].{}", found.field), ..found };
+    }
     let parts = || {
         let (field, rest) = path.split_once('[')?;
         let (index, part) = rest.split_once(']')?;
@@ -307,14 +312,14 @@ mod tests {
         let told = |status: &Status| Error::from_status("http://a", status, true).to_string();
         let wait = Duration::from_nanos(146_655_954);
         let limited = status::rate_limited(RateBound::Calls, wait);
-        assert_eq!(told_wait(&limited), Some(wait));
+        assert_eq!(retry_after(&limited), Some(wait));
         let words = told(&limited);
         assert!(words.ends_with("; come back in 0.147 s") && !words.contains("try again"), "{words}");
         let details = ErrorDetails::with_retry_info(Some(Duration::from_millis(1_234)));
         let full = Status::with_error_details(Code::ResourceExhausted, "full", details);
-        assert_eq!((told(&full).as_str(), told_wait(&full)), ("http://a: full; try again in 1.3 s", None));
+        assert_eq!((told(&full).as_str(), retry_after(&full)), ("http://a: full; try again in 1.3 s", None));
         let memory = status::memory_full(1);
-        assert_eq!(told_wait(&memory), retry_delay(&memory));
+        assert_eq!(retry_after(&memory), Some(Duration::from_secs(2)));
     }
 
     #[test]

@@ -37,7 +37,7 @@ impl From<RawMatches> for InputData {
 /// What a job is created with.
 #[derive(Debug, Clone)]
 pub enum JobInput {
-    /// Sent with the call, or uploaded before it where it is large.
+    /// Sent with the call, or uploaded before it where that is larger than the server's messages.
     Data(InputData),
     /// Uploaded before.
     Uploaded(InputName),
@@ -46,6 +46,16 @@ pub enum JobInput {
 impl<T: Into<InputData>> From<T> for JobInput {
     fn from(data: T) -> Self {
         Self::Data(data.into())
+    }
+}
+
+impl JobInput {
+    /// The length as a message of what may be sent, in bytes.
+    pub(super) fn encoded_len(&self) -> usize {
+        match self {
+            Self::Data(data) => data.encoded_len(),
+            Self::Uploaded(_) => 0,
+        }
     }
 }
 

@@ -15,16 +15,20 @@ use crate::domain::{InputName, Solution, SolveSettings};
 use crate::rpc::convert;
 use crate::rpc::proto::{self, create_job_request::Source};
 
-/// Most bytes of inputs that are sent with a call: what the least `server.max_message_bytes` takes beside settings and
-/// labels.
-pub(super) const MAX_INLINE_BYTES: usize = 512 << 10;
+/// Largest message that any server takes, see `server.max_message_bytes`.
+const LEAST_MAX_MESSAGE_BYTES: usize = 1 << 20;
+
+/// What a request takes at most beside its input and what its caller says: the fields around them, or the name of an
+/// uploaded input.
+pub(super) const BESIDE_BYTES: usize = 256;
 
 /// What a caller says of a job beside input and settings.
 #[derive(Debug, Clone, Default)]
 pub struct JobOptions {
     /// Last part of the job's name; `None`: the server chooses one.
     pub job_id: Option<String>,
-    /// The same id and job give the same job; `None`: one is made, so that a broken call can be repeated.
+    /// The same id and job give the same job; `None`: one is made, so that a broken call can be repeated. An input that
+    /// is sent and the same one uploaded make two jobs.
     pub request_id: Option<String>,
     /// Marks to find the job by.
     pub labels: BTreeMap<String, String>,
@@ -46,7 +50,8 @@ pub struct Page {
 }
 
 impl Client {
-    /// Creates a job that lives on without this client. A large input is [uploaded](Self::upload) first.
+    /// Creates a job that lives on without this client. An input that is larger than the server's messages is
+    /// [uploaded](Self::upload) first, and stays with the server as one that was uploaded by itself.
     ///
     /// # Errors
     /// See [`Error`].
@@ -56,9 +61,10 @@ impl Client {
         settings: &SolveSettings,
         options: JobOptions,
     ) -> Result<Job, Error> {
-        let mut room = MAX_INLINE_BYTES;
-        let source = self.source(input.into(), &mut room).await?;
-        let request = create_request(self.parent(), source, settings, options);
+        let (input, mut request) = (input.into(), create_request(self.parent(), settings, options));
+        let beside = request.encoded_len() + BESIDE_BYTES;
+        let mut room = self.room_for_inputs(beside, input.encoded_len()).await?;
+        request.source = Some(self.source(input, &mut room).await?);
         let mut backoff = Backoff::default();
         loop {
             match backoff.within(self.jobs.create_job(request.clone())).await {
@@ -68,36 +74,30 @@ impl Client {
         }
     }
 
-    /// Uploads an input that is too large to be sent with a call; any other comes back as it is. `on_progress` is told
-    /// how many bytes of how many the server has.
-    ///
-    /// # Errors
-    /// See [`Error`].
-    pub async fn upload_large(
-        &mut self,
-        input: impl Into<JobInput>,
-        on_progress: &mut (dyn FnMut(u64, u64) + Send),
-    ) -> Result<JobInput, Error> {
-        match input.into() {
-            JobInput::Data(data) if data.encoded_len() > MAX_INLINE_BYTES => {
-                let input = EncodedInput::new(data);
-                let total = input.len();
-                Ok(JobInput::Uploaded(self.upload(&input, &mut |bytes| on_progress(bytes, total)).await?))
-            }
-            other => Ok(other),
+    /// Bytes that a message has for inputs, which take `wanted`, beside the rest of its requests.
+    pub(super) async fn room_for_inputs(&mut self, beside: usize, wanted: usize) -> Result<usize, Error> {
+        let mut most = LEAST_MAX_MESSAGE_BYTES;
+        if beside + wanted > most {
+            let send = |mut client: Self, request| async move { client.calibration.get_capabilities(request).await };
+            let limits = self.call(proto::GetCapabilitiesRequest {}, send).await?.input_limits;
+            most = limits.and_then(|limits| usize::try_from(limits.max_message_bytes).ok()).unwrap_or(most);
         }
+        Ok(most.saturating_sub(beside))
     }
 
     /// An input as a request has it: in the message where there is `room` for it, which it takes; uploaded elsewhere.
     pub(super) async fn source(&mut self, input: JobInput, room: &mut usize) -> Result<Source, Error> {
         let name = match input {
-            JobInput::Data(data) => match room.checked_sub(data.encoded_len()) {
-                Some(left) => {
+            JobInput::Data(data) => {
+                if let Some(left) = room.checked_sub(data.encoded_len()) {
                     *room = left;
                     return Ok(data.into_source());
                 }
-                None => self.upload(&EncodedInput::new(data), &mut |_| ()).await?,
-            },
+                let on_upload = self.on_upload.clone();
+                let input = EncodedInput::new(data);
+                let on_progress = &mut |bytes| on_upload.iter().for_each(|on_upload| on_upload(bytes, input.len()));
+                self.upload(&input, on_progress).await?
+            }
             JobInput::Uploaded(name) => name,
         };
         Ok(Source::Input(name.to_string()))
@@ -339,13 +339,8 @@ pub fn ended_as(name: &JobName, state: JobState, failure: Option<&Failure>) -> R
     }
 }
 
-/// A request with a request id, so that it can be made again where the answer is lost.
-pub(super) fn create_request(
-    parent: String,
-    source: Source,
-    settings: &SolveSettings,
-    options: JobOptions,
-) -> proto::CreateJobRequest {
+/// A request without its input, with a request id, so that it can be made again where the answer is lost.
+pub(super) fn create_request(parent: String, settings: &SolveSettings, options: JobOptions) -> proto::CreateJobRequest {
     // What the wire cannot say is far above what a server takes: it says so.
     let time_limit = options.time_limit.map(|limit| prost_types::Duration {
         seconds: i64::try_from(limit.as_secs()).unwrap_or(i64::MAX),
@@ -363,7 +358,7 @@ pub(super) fn create_request(
             webhook: options.webhook_url.map(|url| proto::Webhook { url, ..proto::Webhook::default() }),
             ..proto::Job::default()
         }),
-        source: Some(source),
+        source: None,
     }
 }
 

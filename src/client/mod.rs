@@ -90,6 +90,9 @@ type Keyed = InterceptedService<Answered<Channel>, Bearer>;
 /// What hears of waits.
 type OnWait = Arc<dyn Fn(&Error) + Send + Sync>;
 
+/// What hears how many bytes of how many were uploaded.
+type OnUpload = Arc<dyn Fn(u64, u64) + Send + Sync>;
+
 /// A connection to a server; reconnects by itself. A clone shares the connection.
 #[derive(Clone)]
 pub struct Client {
@@ -103,6 +106,7 @@ pub struct Client {
     /// Whose jobs are created and listed, as names have it.
     tenant: String,
     on_wait: Option<OnWait>,
+    on_upload: Option<OnUpload>,
 }
 
 impl fmt::Debug for Client {
@@ -162,6 +166,7 @@ impl Client {
             answered,
             tenant,
             on_wait: None,
+            on_upload: None,
         })
     }
 
@@ -169,6 +174,11 @@ impl Client {
     /// trouble, as half a minute of silence looks like a hang.
     pub fn on_wait(&mut self, on_wait: impl Fn(&Error) + Send + Sync + 'static) {
         self.on_wait = Some(Arc::new(on_wait));
+    }
+
+    /// Has `on_upload` called while a creation uploads its input, with how many bytes of how many the server has.
+    pub fn on_upload(&mut self, on_upload: impl Fn(u64, u64) + Send + Sync + 'static) {
+        self.on_upload = Some(Arc::new(on_upload));
     }
 
     /// The server's address, as it was given.
@@ -194,7 +204,7 @@ impl Client {
         loop {
             match backoff.within(send(self.clone(), request.clone())).await {
                 Ok(answer) => return Ok(answer.into_inner()),
-                Err(status) if error::told_wait(&status).is_some() => self.pause(&mut backoff, status).await?,
+                Err(status) if error::retry_after(&status).is_some() => self.pause(&mut backoff, status).await?,
                 Err(status) => return Err(self.error(status)),
             }
         }
@@ -202,7 +212,7 @@ impl Client {
 
     /// Waits before another try, or gives up: for good reason, or after too many. Says so once each trouble.
     async fn pause(&self, backoff: &mut Backoff, status: Status) -> Result<(), Error> {
-        let wait = error::told_wait(&status);
+        let wait = error::retry_after(&status);
         let transient = wait.is_some() || error::is_transient(&status);
         let first = transient && backoff.failed(&status);
         if first

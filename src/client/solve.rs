@@ -1,5 +1,8 @@
 //! One job from its input to its result, over one connection after another.
 
+use std::time::Duration;
+
+use tokio::time::timeout;
 use tokio_util::sync::CancellationToken;
 use tonic::Request;
 
@@ -9,6 +12,10 @@ use super::{Client, Error, InputData};
 use crate::domain::job::JobEvent;
 use crate::domain::{Solution, SolveSettings};
 use crate::rpc::proto;
+
+/// How long a solve that is stopped waits until the server takes its cancel. The server cancels the job by itself soon
+/// after the stream is gone.
+const CANCEL_WAIT: Duration = Duration::from_secs(3);
 
 impl Client {
     /// Creates a job, follows it to its end and reads its result. When `stop` is cancelled, so is the job.
@@ -32,8 +39,10 @@ impl Client {
         let last = tokio::select! {
             last = solving.follow_solve(&input, settings, &mut on_named_event) => last?,
             () = stop.cancelled() => {
-                if let Some(name) = &name {
-                    self.cancel(name).await?;
+                if let Some(name) = &name
+                    && let Ok(cancelled) = timeout(CANCEL_WAIT, self.cancel(name)).await
+                {
+                    cancelled?;
                 }
                 return Err(Error::cancelled());
             }
@@ -50,7 +59,8 @@ impl Client {
         settings: &SolveSettings,
         on_event: &mut (dyn FnMut(&JobEvent) + Send),
     ) -> Result<JobEvent, Error> {
-        let config = create_request(self.parent(), input.head(), settings, JobOptions::default());
+        let request = create_request(self.parent(), settings, JobOptions::default());
+        let config = proto::CreateJobRequest { source: Some(input.head()), ..request };
         let mut follower = EventFollower { last_sequence: 0, on_event };
         let mut backoff = Backoff::default();
         loop {

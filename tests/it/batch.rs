@@ -5,21 +5,22 @@ use std::path::Path;
 use crate::support::program::{Serving, run};
 use crate::support::scrape::Page;
 
-/// A table of so many tracks, with this line at the end.
-fn table(directory: &Path, tracks: usize, last: &str) -> String {
+/// A table of so many tracks.
+fn table(directory: &Path, tracks: usize) -> String {
     let path = directory.join(format!("{tracks}.csv"));
     let rows: String = (0..2 * tracks).map(|k| format!("{},{},{k},{}\n", k % 2, k / 2, 3 * k)).collect();
-    std::fs::write(&path, format!("view,track,x,y\n{rows}{last}")).expect("written");
+    std::fs::write(&path, format!("view,track,x,y\n{rows}")).expect("written");
     path.to_str().expect("a path of ours").to_owned()
 }
 
 #[test]
 fn several_inputs_are_several_jobs_or_none() {
     let directory = tempfile::tempdir().expect("a temporary directory");
-    let server = Serving::start(&directory.path().join("data"));
+    let limits = [("SCPSFM_LIMITS__MAX_TRACKS", "4")];
+    let server = Serving::start_with(&directory.path().join("data"), &limits, std::process::Stdio::null());
     let submit = |more: &[&str]| run(["submit", "--method", "geometry", "--server", &server.grpc].iter().chain(more));
     let count = || run(["list", "--server", &server.grpc]).stdout.lines().count();
-    let (a, b) = (table(directory.path(), 3, ""), table(directory.path(), 4, ""));
+    let (a, b) = (table(directory.path(), 3), table(directory.path(), 4));
 
     let both = submit(&[&a, &b, "--request-id", "r", "--label", "of=both"]);
     assert_eq!(both.code, Some(0), "{both:?}");
@@ -35,8 +36,7 @@ fn several_inputs_are_several_jobs_or_none() {
     assert_eq!(count(), 2);
 
     // One that only the server finds bad: the file is named, and nothing is stored.
-    let twice = table(directory.path(), 5, "0,0,9,9\n");
-    let refused = submit(&[&a, &twice]);
+    let refused = submit(&[&a, &table(directory.path(), 5)]);
     assert_eq!(refused.code, Some(65), "{refused:?}");
     assert!(refused.stderr.contains("5.csv") && !refused.stderr.contains("3.csv"), "{refused:?}");
     let by_flag = submit(&[&a, &b, "--label", &format!("{}=x", "k".repeat(64))]);
@@ -60,7 +60,7 @@ fn a_job_that_takes_too_much_memory_is_bad_input_and_names_the_key() {
     let directory = tempfile::tempdir().expect("a temporary directory");
     let bounds = [("SCPSFM_ENGINE__MAX_SOLVER_BYTES", "1000000")];
     let server = Serving::start_with(&directory.path().join("data"), &bounds, std::process::Stdio::null());
-    let refused = run(["submit", &table(directory.path(), 3, ""), "--server", &server.grpc]);
+    let refused = run(["submit", &table(directory.path(), 3), "--server", &server.grpc]);
     assert_eq!(refused.code, Some(65), "{refused:?}");
     assert!(refused.stderr.contains("never fits: engine.max_solver_bytes is 1000000 here"), "{refused:?}");
     assert!(!refused.stderr.contains("try again"), "{refused:?}");
@@ -76,7 +76,7 @@ fn what_never_fits_is_bad_input_and_names_the_key() {
     let directory = tempfile::tempdir().expect("a temporary directory");
     let bounds = [("SCPSFM_ENGINE__QUEUE_CAPACITY", "1"), ("SCPSFM_UPLOAD__TENANT_BYTES", "20")];
     let server = Serving::start_with(&directory.path().join("data"), &bounds, std::process::Stdio::null());
-    let (a, b) = (table(directory.path(), 3, ""), table(directory.path(), 4, ""));
+    let (a, b) = (table(directory.path(), 3), table(directory.path(), 4));
     let batch = run(["submit", &a, &b, "--server", &server.grpc]);
     assert_eq!(batch.code, Some(65), "{batch:?}");
     assert!(batch.stderr.contains("2 jobs in one batch never fit: engine.queue_capacity is 1 here"), "{batch:?}");
