@@ -39,7 +39,7 @@ impl From<Input> for JobInput {
 pub struct JobDescription {
     /// Last part of the job's name; `None`: made here.
     pub job_id: Option<String>,
-    /// Makes creation idempotent; scoped to the tenant.
+    /// Makes creation idempotent; scoped to the tenant. Whoever reads it from a caller checks its form.
     pub request_id: Option<String>,
     pub settings: SolveSettings,
     pub deadline: Option<Deadline>,

@@ -45,6 +45,7 @@ pub fn message(descriptor: &MessageDescriptor, bytes: &[u8]) -> Result<Vec<u8>, 
 /// An answer of that JSON; the permit is held until it is read.
 pub fn json(text: Vec<u8>, permit: Permit) -> Answer {
     let body = Body::new(Body::from(text).map_err(move |error| {
+        // Held until the body is read: a reader that is slow holds it, too.
         let _held = &permit;
         error
     }));

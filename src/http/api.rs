@@ -121,10 +121,9 @@ impl Api {
             }
             return Ok(grpc_web::answer(&self.gateway, connection_info, request).await);
         }
-        if let Some(encoding) =
-            request.headers().get(header::CONTENT_ENCODING).filter(|encoding| *encoding != "identity")
-        {
-            let refused = answer::refuse(HttpRefusal::MediaType, format!("the body is encoded ({encoding:?})"));
+        if let Some(encoding) = content_encoding(request.headers()) {
+            let text = format!("the body is encoded as {}; it is sent without content-encoding", quoted(&encoding));
+            let refused = answer::refuse(HttpRefusal::MediaType, text);
             // RFC 9110, section 15.5.16.
             return Err(Box::new(([(header::ACCEPT_ENCODING, "identity")], *refused).into_response()));
         }
@@ -354,6 +353,15 @@ pub(super) fn call<T>(
     call.extensions_mut().insert(connection_info);
     call.extensions_mut().insert(permit);
     call
+}
+
+/// How a body is encoded, where it is (RFC 9110, section 8.4).
+fn content_encoding(headers: &HeaderMap) -> Option<String> {
+    let values = headers.get_all(header::CONTENT_ENCODING).iter();
+    let values: Vec<_> = values.map(|value| String::from_utf8_lossy(value.as_bytes())).collect();
+    let encodings = values.iter().flat_map(|value| value.split(',')).map(str::trim);
+    let mut encodings = encodings.filter(|encoding| !encoding.is_empty());
+    encodings.find(|encoding| !encoding.eq_ignore_ascii_case("identity")).map(str::to_owned)
 }
 
 /// The media type of a body (RFC 9110, section 8.3.1).

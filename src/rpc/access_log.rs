@@ -68,7 +68,7 @@ fn trace_id(trace_parent: &str) -> Option<String> {
     (id.len() == 32 && id.bytes().all(|byte| byte.is_ascii_hexdigit())).then(|| id.to_owned())
 }
 
-/// Codes of calls that are refused for what the caller is or does, not for what the call asks.
+/// Codes of calls that are refused for what the caller is or does, or for the size of a message.
 const REFUSALS: [Code; 4] = [Code::Unauthenticated, Code::PermissionDenied, Code::ResourceExhausted, Code::OutOfRange];
 
 /// Writes refusals down, those of each code apart: callers without a key hide none of a full queue.

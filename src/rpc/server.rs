@@ -327,16 +327,16 @@ pub struct Gateway {
 }
 
 impl Gateway {
-    /// The tenant of the key that the headers hold, where one is asked for: before a request is read that only a call
+    /// What the key that the headers hold stands for, where one is asked for: before a request is read that only a call
     /// will refuse. Its connection may stay then.
     ///
     /// # Errors
     /// `UNAUTHENTICATED`.
     pub fn check_key(&self, headers: &HeaderMap, connection_info: &ConnectionInfo) -> Result<Grant, Status> {
         let checked = self.calls.authenticate.check(headers);
-        let tenant = checked.inspect_err(|status| self.log_refused(status, connection_info))?;
+        let grant = checked.inspect_err(|status| self.log_refused(status, connection_info))?;
         connection_info.set_authenticated();
-        Ok(tenant)
+        Ok(grant)
     }
 
     /// Writes down that a request was refused before it became a call.

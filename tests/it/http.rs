@@ -159,6 +159,12 @@ fn what_is_wrong_is_told_by_field_and_nothing_is_stored() {
             415,
             "UNSUPPORTED_MEDIA_TYPE",
         ),
+        (
+            request(&server, "POST", jobs, &[json[0], ("content-encoding", "Identity, br")], b"{}"),
+            415,
+            "UNSUPPORTED_MEDIA_TYPE",
+        ),
+        (request(&server, "POST", jobs, &[json[0], ("content-encoding", "Identity")], b"{}"), 400, "INVALID_ARGUMENT"),
         (request(&server, "PUT", jobs, &json, b"{}"), 405, "METHOD_NOT_ALLOWED"),
         (get(&server, "/v1/nothing"), 404, "PATH_NOT_FOUND"),
         (get(&server, "/v1/tenants/default/jobs/none"), 404, "JOB_NOT_FOUND"),
@@ -173,7 +179,7 @@ fn what_is_wrong_is_told_by_field_and_nothing_is_stored() {
         assert_eq!((answer.code, answer.refusal().0.as_str()), (code, reason), "{}", answer.text());
     }
     for reason in ["HOST_REFUSED", "ORIGIN_REFUSED", "UNSUPPORTED_MEDIA_TYPE", "METHOD_NOT_ALLOWED", "PATH_NOT_FOUND"] {
-        let times = if reason == "UNSUPPORTED_MEDIA_TYPE" { 2.0 } else { 1.0 };
+        let times = if reason == "UNSUPPORTED_MEDIA_TYPE" { 3.0 } else { 1.0 };
         assert_eq!(refused(&server, reason), times, "{reason}");
     }
     assert!(request(&server, "PUT", jobs, &json, b"{}").has("allow: "), "says which verbs there are");
