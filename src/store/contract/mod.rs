@@ -82,6 +82,7 @@ macro_rules! store_contract {
             uploads::jobs_know_their_uploaded_inputs,
             uploads::inputs_are_listed_page_by_page,
             uploads::a_deleted_input_is_kept_by_its_jobs_alone,
+            uploads::a_status_beside_deletions_is_whole_or_none,
             uploads::many_that_begin_at_once_share_the_last_room,
             webhooks::every_end_of_a_job_makes_its_webhook_due,
             webhooks::an_attempt_is_leased_and_settled_once,

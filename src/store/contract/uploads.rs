@@ -334,6 +334,30 @@ pub(in crate::store) async fn a_deleted_input_is_kept_by_its_jobs_alone(store: &
     store.give_up_upload(&lease).await.expect("gives up");
 }
 
+/// Looks at an upload whose input is made and deleted meanwhile.
+pub(in crate::store) async fn a_status_beside_deletions_is_whole_or_none(store: &Store) {
+    const ROUNDS: usize = 100;
+    let upload = name("a");
+    let churn = async {
+        for _ in 0..ROUNDS {
+            finished(store, "a", vec![7; 10], 0).await;
+            store.delete_input(&upload).await.expect("is there");
+        }
+    };
+    let looks = async {
+        loop {
+            match store.upload(&upload).await {
+                Ok(_) | Err(Error::UploadNotFound(_)) => {}
+                Err(other) => panic!("{other:?}"),
+            }
+        }
+    };
+    tokio::select! {
+        () = churn => {}
+        () = looks => {}
+    }
+}
+
 pub(in crate::store) async fn many_that_begin_at_once_share_the_last_room(store: &Store) {
     let bounds = UploadBounds { max_tenant_uploads: 3, ..ROOMY };
     let uploads: Vec<_> = (0..24).map(|number| new(&format!("upload-{}", number % 12), 10)).collect();

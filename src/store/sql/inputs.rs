@@ -154,8 +154,15 @@ impl dyn Connection + '_ {
         self.execute(delete.bind(id)).await
     }
 
+    pub(super) async fn find_input(&mut self, id: i64) -> Result<Option<StoredInput>, Error> {
+        let select = Statement::new(select_inputs!("WHERE id = $1")).bind(id);
+        self.optional_row(select).await?.as_ref().map(stored_input).transpose()
+    }
+
+    /// The same of one that the transaction has locked or written.
     pub(super) async fn input_by_id(&mut self, id: i64) -> Result<StoredInput, Error> {
-        stored_input(&self.row(Statement::new(select_inputs!("WHERE id = $1")).bind(id)).await?)
+        let gone = || Error::Corrupt("an input that is held is not there".into());
+        self.find_input(id).await?.ok_or_else(gone)
     }
 
     /// Locks the rows of these inputs, in one order whoever asks for them; those that are not there are passed over.

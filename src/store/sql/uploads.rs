@@ -168,7 +168,11 @@ impl dyn Database {
             let found = connection.find_upload(name, false).await?;
             let Some(upload) = found else { return Err(Error::UploadNotFound(name.clone())) };
             let input = match upload.input_id {
-                Some(id) => Some(connection.input_by_id(id).await?),
+                Some(id) => {
+                    // None where it was deleted between the two looks, and the upload with it.
+                    let input = connection.find_input(id).await?;
+                    Some(input.ok_or_else(|| Error::UploadNotFound(name.clone()))?)
+                }
                 None => None,
             };
             Ok(UploadStatus { bytes: upload.bytes, committed: upload.committed, input })
