@@ -3,7 +3,7 @@
 use nalgebra::{Matrix2, Matrix4, Vector2, Vector4};
 
 use super::block::Block;
-use super::consensus::{self, Consensus, LEAST_VIEWS, NoiseOptions};
+use super::consensus::{self, Consensus, LEAST_INLIERS, LEAST_VIEWS, NoiseOptions};
 use super::noise_model::evidence;
 use super::problem::Problem;
 use super::view_selection::evenly;
@@ -16,14 +16,12 @@ use crate::geometry::{Camera, Point};
 options! {
     /// What a reconstruction measures.
     pub struct ProjectiveOptions {
-        /// Spread of the points of a view across the line that fits them best, in units of the noise, from which they
-        /// lie off it. Points on a line are spread by one; the noise is known to a factor of two.
+        /// Distance of a point from the line that fits a view best, in units of the noise, from which it lies off it.
+        /// Points on a line are off by one; the noise is known to a factor of two.
         least_across: f64 = 4.0,
-        /// Share of the points of a view that the line is fitted to, in views of ten points or more. A few points off
-        /// the line of all others are no structure.
-        fitted_share: f64 = 0.9,
-        /// The line is fitted again while that lowers the spread to less than this share. The spread of points that
-        /// are on no line settles at the third fit; that of others falls at each as points beside the line leave.
+        /// Share of the points of a view that the line is fitted to, which are on it where most are.
+        fitted_share: f64 = 0.5,
+        /// The line is fitted again while that lowers the spread of its points to less than this share.
         settled: f64 = 0.95,
     }
 }
@@ -83,13 +81,17 @@ impl ProjectiveReconstruction {
         projective::unknowns(self.views.len(), self.tracks.len())
     }
 
-    /// Whether the points of three views or more lie off a line: those on one measure one coordinate, where chance is
-    /// reckoned with two.
+    /// Whether enough points of three views or more lie off a line. Those on one measure one coordinate, where chance is
+    /// reckoned with two, and leave the cameras free to fit a few points beside it, wherever these are.
     pub fn is_off_lines(&self) -> bool {
         let least_across = OPTIONS.least_across * NoiseOptions::DEFAULT.clamp(self.noise);
         let mut of_view = vec![Vec::new(); self.views.len()];
         self.observations.iter().for_each(|seen| of_view[seen.view].push(seen.xy));
-        of_view.into_iter().filter_map(spread_across).filter(|across| *across >= least_across).count() >= LEAST_VIEWS
+        let is_off_line = |points: &Vec<Vector2<f64>>| {
+            let least = LEAST_INLIERS.min(points.len().div_ceil(4)).max(1);
+            across(points.clone()).into_iter().filter(|across| *across >= least_across).count() >= least
+        };
+        of_view.iter().filter(|points| is_off_line(points)).count() >= LEAST_VIEWS
     }
 
     /// The tracks with most observations, evenly among equals: a calibration takes no more than these.
@@ -202,27 +204,24 @@ fn frame_with_plane_at_infinity(plane: &Vector4<f64>) -> Option<Matrix4<f64>> {
     })
 }
 
-/// Root mean square distance of most points of a view from the line that fits those best (least trimmed squares,
-/// Rousseeuw 1984); `None` without points.
-fn spread_across(mut points: Vec<Vector2<f64>>) -> Option<f64> {
+/// Distances of points from the line that fits half of them best (least trimmed squares, Rousseeuw 1984).
+fn across(mut points: Vec<Vector2<f64>>) -> Vec<f64> {
     let fitted = (OPTIONS.fitted_share * points.len() as f64).ceil() as usize;
     let (mut count, mut before) = (points.len(), f64::INFINITY);
     loop {
-        let near = points.get(..count).filter(|near| !near.is_empty())?;
+        let Some(near) = points.get(..count).filter(|near| !near.is_empty()) else { return Vec::new() };
         let mean = near.iter().sum::<Vector2<f64>>() / count as f64;
         let covariance: Matrix2<f64> = near.iter().map(|xy| (xy - mean) * (xy - mean).transpose()).sum();
         let axes = (covariance / count as f64).symmetric_eigen();
-        let across = axes.eigenvalues.imin();
-        let spread = axes.eigenvalues[across].max(0.0).sqrt();
+        let least = axes.eigenvalues.imin();
+        let spread = axes.eigenvalues[least].max(0.0).sqrt();
+        let normal = axes.eigenvectors.column(least).into_owned();
+        let distance = |xy: &Vector2<f64>| normal.dot(&(xy - mean)).abs();
         // Points that lie off the line of the others turn the first fits, and less each time.
         if spread >= OPTIONS.settled * before {
-            return Some(spread);
+            return points.iter().map(distance).collect();
         }
-        let normal = axes.eigenvectors.column(across).into_owned();
-        let nearer = |a: &Vector2<f64>, b: &Vector2<f64>| {
-            f64::total_cmp(&normal.dot(&(a - mean)).abs(), &normal.dot(&(b - mean)).abs())
-        };
-        points.select_nth_unstable_by(fitted - 1, nearer);
+        points.select_nth_unstable_by(fitted - 1, |a, b| f64::total_cmp(&distance(a), &distance(b)));
         (count, before) = (fitted, spread);
     }
 }

@@ -2,6 +2,7 @@
 
 use std::collections::BTreeMap;
 
+use nalgebra::{Rotation3, Vector3};
 use rand::seq::index;
 use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
@@ -103,5 +104,40 @@ fn points_on_a_line_in_each_view_are_no_reconstruction() {
             let solution = solved(&input, &SolveSettings::default());
             assert_eq!(solution.grade, None, "{views} views of {tracks} tracks, {off} off: {:?}", solution.warnings);
         }
+    }
+}
+
+/// The images of one line in space tell of one coordinate: the cameras are free to fit tracks that are anywhere.
+#[test]
+fn a_line_in_space_and_a_few_wrong_tracks_are_no_reconstruction() {
+    let tracks = 100;
+    for (seed, views, wrong) in [(1, 5, 1), (2, 5, 2), (3, 5, 5), (4, 10, 1), (5, 10, 2), (6, 10, 5), (7, 6, 20)] {
+        let mut rng = ChaCha8Rng::seed_from_u64(seed);
+        let along: Vec<f64> = (0..tracks).map(|_| rng.random_range(-1.0..1.0)).collect();
+        let size = Some(ImageSize { width_px: 1000, height_px: 1000 });
+        let views = vec![View { size, ..View::default() }; views];
+        let mut raw = RawInput { track_count: tracks, ..RawInput::default() };
+        for view in 0..views.len() {
+            let axis = Vector3::from_fn(|_, _| rng.random_range(-0.4..0.4));
+            let rotation = Rotation3::from_scaled_axis(axis);
+            let shift = Vector3::new(rng.random_range(-1.0..1.0), rng.random_range(-1.0..1.0), 6.0);
+            for (track, along) in along.iter().enumerate() {
+                let seen: Vector3<f64> = rotation * Vector3::new(2.0, 1.0, 0.5) * *along + shift;
+                let right = |k: usize| 1000.0 * seen[k] / seen.z + 500.0;
+                let mut noise = || rng.random_range(-0.5..0.5);
+                let [x, y] = [0, 1].map(right);
+                let [dx, dy] = [noise(), noise()];
+                let anywhere = [rng.random_range(0.0..1000.0), rng.random_range(0.0..1000.0)];
+                let [x, y] = if track < wrong { anywhere } else { [x + dx, y + dy] };
+                raw.view.push(view as u32);
+                raw.track.push(track as u32);
+                raw.x.push(x);
+                raw.y.push(y);
+            }
+        }
+        raw.views = views;
+        let input = Input::new(raw, &Limits::default(), "line").expect("valid input");
+        let solution = solved(&input, &SolveSettings::default());
+        assert_eq!(solution.grade, None, "seed {seed}, {wrong} wrong: {:?}", solution.warnings);
     }
 }
