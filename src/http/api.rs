@@ -10,6 +10,7 @@ use axum::http::uri::Authority;
 use axum::http::{HeaderMap, Method, header};
 use axum::response::IntoResponse;
 use futures_util::StreamExt;
+use http_body::Body as _;
 use prost::Message;
 use prost::bytes::Bytes;
 use prost_reflect::{DescriptorPool, DynamicMessage, MessageDescriptor, ReflectMessage};
@@ -121,7 +122,7 @@ impl Api {
             }
             return Ok(grpc_web::answer(&self.gateway, connection_info, request).await);
         }
-        if let Some(encoding) = content_encoding(request.headers()) {
+        if let Some(encoding) = content_encoding(request.headers()).filter(|_| !request.body().is_end_stream()) {
             let text = format!("the body is encoded as {}; it is sent without content-encoding", quoted(&encoding));
             let refused = answer::refuse(HttpRefusal::MediaType, text);
             // RFC 9110, section 15.5.16.
