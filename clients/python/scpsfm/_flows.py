@@ -289,8 +289,18 @@ def submit_batch(
 ) -> Flow[list[job_pb2.Job]]:
     """Creates a job of each input, all or none; large ones are uploaded first."""
     trouble = Trouble(context, timeout)
+    try:
+        return (yield from _create_batch(context, trouble, inputs, options, context.upload_above_bytes))
+    except MessageTooLarge:
+        # A server that takes less in a message.
+        return (yield from _create_batch(context, trouble, inputs, options, 0))
+
+
+def _create_batch(
+    context: Context, trouble: Trouble, inputs: Sequence[Source | str], options: JobOptions, room: int
+) -> Flow[list[job_pb2.Job]]:
+    """Creates a job of each input; those that together have more than `room` bytes are uploaded first."""
     batch = job_service_pb2.BatchCreateJobsRequest(parent=context.parent)
-    room = context.upload_above_bytes
     for number, tracks in enumerate(inputs, start=1):
         # One that is given stands, with the number of the job after it, for each of them.
         request_id = None if options.request_id is None else f"{options.request_id}-{number}"

@@ -149,17 +149,21 @@ class Fake(
             self.by_request_id[request.request_id] = name
             return job
 
-    def CreateJob(self, request: Any, context: Any) -> Any:
-        self._begin("CreateJob", request, context)
+    def _check_size(self, request: Any, context: Any) -> None:
         if request.ByteSize() > self.max_message_bytes:
             refusal = Refusal(grpc.StatusCode.OUT_OF_RANGE, "message too large", "MESSAGE_TOO_LARGE")
             context.abort_with_status(refusal)
+
+    def CreateJob(self, request: Any, context: Any) -> Any:
+        self._begin("CreateJob", request, context)
+        self._check_size(request, context)
         job = self._create(request)
         self._end("CreateJob", context)
         return job
 
     def BatchCreateJobs(self, request: Any, context: Any) -> Any:
         self._begin("BatchCreateJobs", request, context)
+        self._check_size(request, context)
         jobs = [self._create(one) for one in request.requests]
         self._end("BatchCreateJobs", context)
         return job_service_pb2.BatchCreateJobsResponse(jobs=jobs)

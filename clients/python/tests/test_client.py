@@ -451,8 +451,11 @@ def test_a_message_above_the_servers_limit_is_uploaded_instead(
     fake.max_message_bytes = 1000
     with support.client_of(kind, running.address, retry=QUICK) as client:
         job = client.submit(large)
-    assert len(fake.calls["CreateJob"]) == 2
-    assert job.known.input in fake.inputs
+        assert len(fake.calls["CreateJob"]) == 2
+        assert job.known.input in fake.inputs
+        jobs = client.submit_batch([large, large])
+    assert len(fake.calls["BatchCreateJobs"]) == 2
+    assert [one.known.input for one in jobs] == [job.known.input] * 2
 
 
 def test_a_batch_uploads_what_does_not_fit(
