@@ -28,7 +28,7 @@ pub struct JobOptions {
     /// Last part of the job's name; `None`: the server chooses one.
     pub job_id: Option<String>,
     /// The same id and job give the same job; `None`: one is made, so that a broken call can be repeated. An input that
-    /// is sent and the same one uploaded make two jobs.
+    /// is sent and the same one uploaded are not the same job, whose id is refused then.
     pub request_id: Option<String>,
     /// Marks to find the job by.
     pub labels: BTreeMap<String, String>,
