@@ -19,6 +19,9 @@ options! {
         /// Distance of a point from the line that fits a view best, in units of the noise, from which it lies off it.
         /// Points on a line are off by one; the noise is known to a factor of two.
         least_across: f64 = 4.0,
+        /// Share of the points of a view that have to lie off it where they are few; of more, as many as verify a
+        /// reconstruction by themselves. A line leaves six unknowns of a camera free, which fit three tracks or so.
+        off_line_share: f64 = 0.25,
         /// Share of the points of a view that the line is fitted to, which are on it where most are.
         fitted_share: f64 = 0.5,
         /// The line is fitted again while that lowers the spread of its points to less than this share.
@@ -87,11 +90,12 @@ impl ProjectiveReconstruction {
         let least_across = OPTIONS.least_across * NoiseOptions::DEFAULT.clamp(self.noise);
         let mut of_view = vec![Vec::new(); self.views.len()];
         self.observations.iter().for_each(|seen| of_view[seen.view].push(seen.xy));
-        let is_off_line = |points: &Vec<Vector2<f64>>| {
-            let least = LEAST_INLIERS.min(points.len().div_ceil(4)).max(1);
-            across(points.clone()).into_iter().filter(|across| *across >= least_across).count() >= least
+        let is_off_line = |distances: &Vec<f64>| {
+            let few = (OPTIONS.off_line_share * distances.len() as f64).ceil() as usize;
+            let off = distances.iter().filter(|distance| **distance >= least_across).count();
+            off >= LEAST_INLIERS.min(few).max(1)
         };
-        of_view.iter().filter(|points| is_off_line(points)).count() >= LEAST_VIEWS
+        of_view.into_iter().map(across).filter(is_off_line).count() >= LEAST_VIEWS
     }
 
     /// The tracks with most observations, evenly among equals: a calibration takes no more than these.
