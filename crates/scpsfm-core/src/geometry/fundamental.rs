@@ -185,7 +185,7 @@ pub(crate) fn robust(
     rng: &mut ChaCha8Rng,
     stop: &StopToken,
 ) -> Option<RobustModel<Fundamental>> {
-    ransac::estimate(&matches, squared_gate(noise), None, MOST_SAMPLES, rng, stop)
+    ransac::estimate(&matches, squared_gate(noise), None, 0, MOST_SAMPLES, rng, stop)
 }
 
 impl Estimator for &[Match] {

@@ -88,15 +88,17 @@ pub(crate) struct Correspondences<'a> {
 /// The pose that most correspondences agree with, refined on those that do; an inlier is in front of the camera.
 ///
 /// * `gate`: squared distance, in the same units, within which an image of weight 1 agrees
+/// * `inliers_to_beat`: as of [`ransac::estimate`]
 ///
 /// Returns `None` for fewer than three correspondences or when no sample gives a pose.
 pub(crate) fn robust(
     seen: &Correspondences,
     gate: f64,
+    inliers_to_beat: usize,
     rng: &mut ChaCha8Rng,
     stop: &StopToken,
 ) -> Option<RobustModel<Pose>> {
-    ransac::estimate(seen, gate, None, MOST_SAMPLES, rng, stop)
+    ransac::estimate(seen, gate, None, inliers_to_beat, MOST_SAMPLES, rng, stop)
 }
 
 /// The same of a camera at the origin, which sees directions: its pose has no translation.
@@ -105,10 +107,11 @@ pub(crate) fn robust(
 pub(crate) fn robust_rotation(
     seen: &Correspondences,
     gate: f64,
+    inliers_to_beat: usize,
     rng: &mut ChaCha8Rng,
     stop: &StopToken,
 ) -> Option<RobustModel<Pose>> {
-    ransac::estimate(&Directions(*seen), gate, None, MOST_SAMPLES, rng, stop)
+    ransac::estimate(&Directions(*seen), gate, None, inliers_to_beat, MOST_SAMPLES, rng, stop)
 }
 
 /// Points at infinity, from a camera at the origin.
@@ -250,7 +253,7 @@ mod tests {
                 .collect();
             seen[..36].rotate_left(7);
             let gate = CHI_SQUARE_OF_TWO * NOISE * NOISE;
-            let found = robust_rotation(&of(&directions, &seen, &[1.0; 60]), gate, &mut rng, &StopToken::default());
+            let found = robust_rotation(&of(&directions, &seen, &[1.0; 60]), gate, 0, &mut rng, &StopToken::default());
             let RobustModel { model, inlier, .. } = found.expect("a rotation");
             let off = (model.rotation - turned).norm();
             println!("seed {seed}: off by {off:.1e}, {} inliers", inlier.iter().filter(|inlier| **inlier).count());
@@ -261,7 +264,7 @@ mod tests {
         }
         let (direction, image, mut rng) = ([Vector3::z()], [Vector2::zeros()], ChaCha8Rng::seed_from_u64(1));
         let one = of(&direction, &image, &[1.0]);
-        assert_eq!(robust_rotation(&one, 1e-4, &mut rng, &StopToken::default()), None);
+        assert_eq!(robust_rotation(&one, 1e-4, 0, &mut rng, &StopToken::default()), None);
     }
 
     #[test]
@@ -272,9 +275,9 @@ mod tests {
         assert!(three_points(&[nan, same, same * 2.0], &[Vector2::zeros(); 3]).is_empty());
         let mut rng = ChaCha8Rng::seed_from_u64(1);
         let stop = StopToken::default();
-        assert_eq!(robust(&of(&[same; 2], &[Vector2::zeros(); 2], &[1.0; 2]), 1e-4, &mut rng, &stop), None);
-        assert_eq!(robust(&of(&[same; 9], &[Vector2::zeros(); 9], &[1.0; 9]), 1e-4, &mut rng, &stop), None);
-        assert_eq!(robust(&of(&[same; 9], &[Vector2::zeros(); 9], &[1.0; 9]), f64::NAN, &mut rng, &stop), None);
+        assert_eq!(robust(&of(&[same; 2], &[Vector2::zeros(); 2], &[1.0; 2]), 1e-4, 0, &mut rng, &stop), None);
+        assert_eq!(robust(&of(&[same; 9], &[Vector2::zeros(); 9], &[1.0; 9]), 1e-4, 0, &mut rng, &stop), None);
+        assert_eq!(robust(&of(&[same; 9], &[Vector2::zeros(); 9], &[1.0; 9]), f64::NAN, 0, &mut rng, &stop), None);
     }
 
     #[test]
@@ -291,7 +294,8 @@ mod tests {
                 }
             }
             let (gate, weights) = (CHI_SQUARE_OF_TWO * NOISE * NOISE, vec![1.0; seen.len()]);
-            let found = robust(&of(&points, &seen, &weights), gate, &mut rng, &StopToken::default()).expect("a pose");
+            let found =
+                robust(&of(&points, &seen, &weights), gate, 0, &mut rng, &StopToken::default()).expect("a pose");
             let right = found.inlier.iter().enumerate().filter(|(k, inlier)| (k % 3 == 0) == **inlier).count();
             let away = distance(&found.model, &scene.poses[2]);
             println!("seed {seed}: {right} of 90 verdicts right, pose off by {away}");
@@ -316,7 +320,7 @@ mod tests {
             let mut away = |weights: &[f64]| {
                 let gate = CHI_SQUARE_OF_TWO * NOISE * NOISE;
                 let found =
-                    robust(&of(&points, &seen, weights), gate, &mut rng, &StopToken::default()).expect("a pose");
+                    robust(&of(&points, &seen, weights), gate, 0, &mut rng, &StopToken::default()).expect("a pose");
                 (distance(&found.model, &scene.poses[2]), found.inlier_count())
             };
             let (by_weights, by_all) = (away(&weights), away(&vec![1.0; seen.len()]));
@@ -350,12 +354,30 @@ mod tests {
                     *image = placed.xy() / placed.z + 3.0 * NOISE * Vector2::new(angle.cos(), angle.sin());
                 }
             }
-            let found = robust(&of(&points, &seen, &vec![1.0; seen.len()]), gate, &mut rng, &StopToken::default())
+            let found = robust(&of(&points, &seen, &vec![1.0; seen.len()]), gate, 0, &mut rng, &StopToken::default())
                 .expect("a pose");
             let kept = found.inlier[..40].iter().filter(|&&inlier| inlier).count();
             right += usize::from(kept == 40);
         }
         println!("{right} of 40");
         assert_eq!(right, 40);
+    }
+
+    /// Where no more can agree than agreed with another pose, few samples are drawn.
+    #[test]
+    fn a_pose_that_beats_nothing_is_not_sought_for_long() {
+        let scene = testing::scene(1, 4, 100, 0.0);
+        let (points, mut seen) = correspondences(&scene, 2);
+        seen[50..].reverse();
+        let drawn_for = |inliers_to_beat: usize| {
+            let mut rng = ChaCha8Rng::seed_from_u64(1);
+            let all = [1.0; 100];
+            let found = robust(&of(&points, &seen, &all), 1e-8, inliers_to_beat, &mut rng, &StopToken::default());
+            (found.map_or(0, |found| found.inlier_count()), rng.get_word_pos())
+        };
+        let (inliers, of_all) = drawn_for(0);
+        assert_eq!(inliers, 50);
+        let (_, of_few) = drawn_for(99);
+        assert!(4 * of_few < of_all, "{of_few} of {of_all}");
     }
 }

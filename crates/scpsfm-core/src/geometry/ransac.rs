@@ -139,6 +139,7 @@ impl<M> RobustModel<M> {
 ///
 /// * `gate`: squared residual within which a datum agrees
 /// * `start`: a model to begin with, as if a sample had given it
+/// * `inliers_to_beat`: of another model, as if a sample had given it: one with fewer inliers is of no use
 ///
 /// Draws until [`CONFIDENCE`] is reached for the share of inliers found, `most_samples` at most. Every sample that is
 /// better than those before is optimised: fitted to the data within [`Estimator::SAMPLE_GATES`] gates, then to those
@@ -149,6 +150,7 @@ pub(crate) fn estimate<E: Estimator>(
     estimator: &E,
     gate: f64,
     start: Option<E::Model>,
+    inliers_to_beat: usize,
     most_samples: usize,
     rng: &mut ChaCha8Rng,
     stop: &StopToken,
@@ -156,7 +158,8 @@ pub(crate) fn estimate<E: Estimator>(
     if estimator.len() < E::SAMPLE || !(gate > 0.0 && gate.is_finite()) {
         return None;
     }
-    let mut search = Search { estimator, gate, best: None, best_sample_cost: f64::INFINITY, wanted: most_samples };
+    let wanted = most_samples.min(samples_wanted(inliers_to_beat, estimator.len(), E::SAMPLE));
+    let mut search = Search { estimator, gate, best: None, best_sample_cost: f64::INFINITY, wanted };
     start.into_iter().for_each(|start| search.offer(start));
     let mut drawn = 0;
     while drawn < search.wanted && !(drawn % STOP_EVERY == 0 && stop.is_stopped()) {
@@ -243,5 +246,6 @@ mod tests {
         // C(12, 6) / C(40, 6) of the samples are right.
         assert_eq!(samples_wanted(12, 40, 6), 19_128);
         assert!(samples_wanted(7, 100, 8) > 1_000_000);
+        assert_eq!(samples_wanted(0, 100, 3), usize::MAX);
     }
 }

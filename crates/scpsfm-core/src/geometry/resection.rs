@@ -79,7 +79,7 @@ pub fn robust(
     let resection = Resection { points: points.iter().map(|point| point.normalize()).collect(), images, weights };
     // Most images are right as a rule: all together first.
     let all = linear(points, images);
-    let found = ransac::estimate(&resection, gate, all, MOST_SAMPLES, rng, stop)?;
+    let found = ransac::estimate(&resection, gate, all, 0, MOST_SAMPLES, rng, stop)?;
     (found.inlier_count() >= least.max(LEAST_POINTS)).then_some((found.model, found.inlier))
 }
 

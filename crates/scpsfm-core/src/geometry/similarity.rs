@@ -89,7 +89,7 @@ pub(crate) fn robust(
     if observations.of_cameras.is_empty() {
         return None;
     }
-    ransac::estimate(&observations, gate, None, MOST_SAMPLES, rng, stop)
+    ransac::estimate(&observations, gate, None, 0, MOST_SAMPLES, rng, stop)
 }
 
 struct CrossObservations<'a> {

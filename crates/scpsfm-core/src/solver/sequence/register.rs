@@ -107,13 +107,14 @@ impl Growth for Component<'_> {
     fn register(&mut self, view: usize, seen: &[usize], recorder: &mut Recorder) -> usize {
         let Self { problem, model, component, options, rng } = self;
         let is_new_lens = model.is_focal_unknown(problem, view);
-        let found = guesses(problem, model, view)
-            .into_iter()
-            .filter_map(|intrinsics| Some((intrinsics, robust_pose(problem, model, &intrinsics, seen, rng)?)))
-            // The first of equals.
-            .rev()
-            .max_by_key(|(_, (_, agreeing))| *agreeing);
-        let Some((intrinsics, (pose, agreeing))) = found else { return 0 };
+        let mut found: Option<(Intrinsics, Pose, usize)> = None;
+        for intrinsics in guesses(problem, model, view) {
+            let to_beat = found.as_ref().map_or(0, |(.., agreeing)| *agreeing);
+            let better = robust_pose(problem, model, &intrinsics, seen, to_beat, rng);
+            let better = better.filter(|(_, agreeing)| found.is_none() || *agreeing > to_beat);
+            found = better.map(|(pose, agreeing)| (intrinsics, pose, agreeing)).or(found);
+        }
+        let Some((intrinsics, pose, agreeing)) = found else { return 0 };
         let is_enough =
             agreeing >= options.least_agreeing && agreeing as f64 >= options.least_share * seen.len() as f64;
         let is_held = model.poses[view].is_some();
@@ -181,11 +182,14 @@ fn guesses(problem: &Problem, model: &Model, view: usize) -> Vec<Intrinsics> {
 }
 
 /// The pose that most of these observations agree with, and how many do.
+///
+/// * `inliers_to_beat`: as of [`pose::robust`]
 fn robust_pose(
     problem: &Problem,
     model: &Model,
     intrinsics: &Intrinsics,
     seen: &[usize],
+    inliers_to_beat: usize,
     rng: &mut ChaCha8Rng,
 ) -> Option<(Pose, usize)> {
     let datum = |&k: &usize| {
@@ -197,7 +201,8 @@ fn robust_pose(
     let (rays, weights): (Vec<_>, Vec<_>) = seen.into_iter().unzip();
     let gate = problem.gate(model.noise) / intrinsics.focal.powi(2);
     let robust = if model.has_common_centre { pose::robust_rotation } else { pose::robust };
-    let found = robust(&Correspondences { points: &points, seen: &rays, weights: &weights }, gate, rng, problem.stop)?;
+    let correspondences = Correspondences { points: &points, seen: &rays, weights: &weights };
+    let found = robust(&correspondences, gate, inliers_to_beat, rng, problem.stop)?;
     Some((found.model, found.inlier_count()))
 }
 
