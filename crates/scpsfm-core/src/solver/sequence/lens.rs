@@ -80,7 +80,8 @@ impl BehindLenses {
 }
 
 /// Solves an input behind the lenses that explain seeds better than pinholes, and where that does not replace what
-/// pinholes gave, behind those that it calibrated; `None` where no lens explains seeds better. No lens is undone then.
+/// pinholes gave, behind those that it calibrated; `None` where no lens explains seeds better, or most views. No lens
+/// is undone then.
 pub fn solve_behind(
     problem: &mut Problem,
     of_pinholes: &Ended,
@@ -89,7 +90,14 @@ pub fn solve_behind(
     if !undo(problem, recorder)? {
         return Ok(None);
     }
-    let mut ended = QuickPass::new(problem, recorder)?.finish(problem, recorder)?;
+    let quick = QuickPass::new(problem, recorder)?;
+    let found = quick.result();
+    let explains_more = found.evidence(problem) > of_pinholes.evidence(problem);
+    if found.calibrated_extension(problem).is_none() && found.holds_most_views() && !explains_more {
+        problem.undone = None;
+        return Ok(None);
+    }
+    let mut ended = quick.finish(problem, recorder)?;
     let calibrated = ended.calibrated_extension(problem).filter(|_| !replaces(&ended, of_pinholes, problem));
     if calibrated.is_some_and(|extended| undo_calibrated(problem, extended)) {
         ended = QuickPass::new(problem, recorder)?.finish(problem, recorder)?;
