@@ -107,6 +107,12 @@ impl Undone {
         Some(Self { lenses, radii, observations })
     }
 
+    /// What the undone lens of each camera says of its focal length; `None` of a pinhole, which none is undone of.
+    pub fn focal_priors(&self, scale_px: f64, sigma_log: f64) -> Vec<Option<FocalPrior>> {
+        let of_lens = |lens: &Intrinsics| FocalPrior { focal_px: lens.focal * scale_px, sigma_log };
+        self.lenses.iter().map(|lens| lens.distorts().then(|| of_lens(lens))).collect()
+    }
+
     /// The lens of the images of a camera for which these intrinsics are found once its lens is undone.
     pub fn behind(&self, camera: usize, found: &Intrinsics) -> Intrinsics {
         let lens = &self.lenses[camera];

@@ -261,7 +261,8 @@ pub fn search_block(
     Ok(attempt)
 }
 
-/// Calibrates what stands of an attempt.
+/// Calibrates what stands of an attempt. Behind an undone lens a camera that did not turn gets the focal length of the
+/// lens: an extension, which adjusts it in the images, asks whether it holds.
 pub fn calibrate(
     problem: &Problem,
     attempt: &mut Attempt,
@@ -274,7 +275,23 @@ pub fn calibrate(
         (VerifiedBy::Depths { focal }, Some(consensus)) => {
             depths::calibrate(problem, &attempt.block.complete, consensus, *focal)
         }
-        _ => calibrate_projective(problem, projective, priors)?,
+        _ => {
+            let found = calibrate_projective(problem, projective, priors)?;
+            let did_not_turn = found.warnings.iter().any(|warning| warning.code == WarningCode::PureTranslation);
+            match problem.undone.as_ref().filter(|_| did_not_turn && !problem.has_own_focals()) {
+                Some(undone) => {
+                    let mut of_lenses = undone.focal_priors(problem.scale_px, OPTIONS.undone_sigma);
+                    for (of_lens, known) in of_lenses.iter_mut().zip(&problem.focal_priors) {
+                        *of_lens = known.or(*of_lens);
+                    }
+                    for (of_lens, known) in of_lenses.iter_mut().zip(priors) {
+                        *of_lens = known.or(*of_lens);
+                    }
+                    calibrate_projective(problem, projective, &of_lenses)?
+                }
+                None => found,
+            }
+        }
     });
     if let Some(intrinsics) = attempt.calibration.as_ref().and_then(Outcome::intrinsics) {
         recorder.hypothesis.focal_px = Some(intrinsics.focal * problem.scale_px);

@@ -12,6 +12,9 @@ options! {
         /// other errors than noise bound what it gives.
         most_calibrated: usize = 600,
         calibrated_observations: usize = 20_000,
+        /// Standard deviation of the log focal length that an undone lens stands for where the camera did not turn. The
+        /// last step between sampled lenses is 1.5 %.
+        undone_sigma: f64 = 0.02,
         /// Tracks that PAPER and SCPSFM optimise weights for, in up to 16 optimisations a block. The most that the
         /// recipe was measured with (20 views).
         network_tracks: usize = 1_000,

@@ -256,10 +256,15 @@ pub fn from_metric(
     let undistorted = is_fisheye.then(|| misfit::undistorted(of_stretch, on.observations));
     let on = &Uncalibrated { observations: undistorted.as_deref().unwrap_or(on.observations), ..*on };
     let Compared { fit, critical, mut warnings, .. } = Compared::new(problem, on, scale_px, stop, heartbeat)?;
-    warnings.extend(critical.warnings);
+    // Its distortion tells the focal length of a fisheye, whether it turns or not.
+    let tells_focal = is_fisheye && !metric.has_common_centre && matches!(critical.upgrade, Upgrade::Translation(_));
+    if !tells_focal {
+        warnings.extend(critical.warnings);
+    }
     let fit = match (critical.upgrade, metric.has_common_centre) {
         (Upgrade::Rotation { free, .. }, true) => free,
         (Upgrade::Quadric(_) | Upgrade::Plane(_), false) => fit,
+        (Upgrade::Translation(_), false) if tells_focal => fit,
         (upgrade, has_common_centre) => {
             let detail = match (upgrade, has_common_centre) {
                 (Upgrade::Rotation { .. }, _) => "the views together are those of a camera that only turned",
