@@ -6,6 +6,7 @@ use super::register;
 use super::{adjust, calibrate, components, growth, structure};
 use crate::domain::{Grade, LeftOut, Stage, Task, Warning, WarningCode};
 use crate::geometry::bundle::metric::MetricReconstruction;
+use crate::geometry::observation::Observation;
 use crate::solver::attempt::Attempt;
 use crate::solver::calibration::Outcome;
 use crate::solver::classification::Geometry;
@@ -59,7 +60,16 @@ pub fn extend(problem: &Problem, seed: Attempt, recorder: &mut Recorder) -> Resu
     recorder.enter(Stage::Calibrate);
     let mut calibrations = calibrate::calibrate(problem, &mut model, recorder)?;
     if model.is_strained {
-        calibrations.iter_mut().for_each(|outcome| refuse(problem, &model, outcome));
+        let detail = format!(
+            "the views together fit much worse than the block that they were registered against: more than {:.2} px",
+            model.noise * problem.scale_px
+        );
+        calibrations.iter_mut().for_each(|outcome| refuse(outcome, detail.clone()));
+    }
+    for (outcome, magnification) in calibrations.iter_mut().zip(magnifications(problem, &model)) {
+        if magnification > OPTIONS.most_magnification {
+            refuse(outcome, format!("the lens would move observations outwards by a factor of {magnification:.1}"));
+        }
     }
     problem.stopped()?;
     components::largest_first(&mut model);
@@ -67,14 +77,30 @@ pub fn extend(problem: &Problem, seed: Attempt, recorder: &mut Recorder) -> Resu
     Ok(Extended { seed, model, calibrations, left_out })
 }
 
-/// Takes back a calibration under which the sequence does not hold together.
-fn refuse(problem: &Problem, model: &Model, outcome: &mut Outcome) {
-    let detail = format!(
-        "the views together fit much worse than the block that they were registered against: more than {:.2} px",
-        model.noise * problem.scale_px
-    );
+/// Takes back a calibration that does not describe the images, for this reason.
+fn refuse(outcome: &mut Outcome, detail: String) {
     outcome.warnings.push(Warning::new(WarningCode::ModelMismatch, detail));
     outcome.grade = Grade::ProjectiveOnly;
+}
+
+/// Largest factor by which the lens of each camera moves an observation that it keeps away from the principal point, 1
+/// at least. Views whose focal length is not determined say nothing of their lens.
+fn magnifications(problem: &Problem, model: &Model) -> Vec<f64> {
+    let mut largest = vec![1.0f64; problem.cameras];
+    for k in (0..model.kept.len()).filter(|&k| model.kept[k]) {
+        let view = problem.view_of(k);
+        let lens = model.intrinsics_of(problem, view);
+        if !lens.distorts() || !model.is_determined(view) {
+            continue;
+        }
+        let distance = |seen: &Observation| (seen.xy - lens.principal_point).norm();
+        if let Some(undistorted) = model.observation(problem, k) {
+            let of_camera = &mut largest[problem.camera_of[view]];
+            // At the principal point it is no number, which the maximum leaves out.
+            *of_camera = of_camera.max(distance(&problem.observation(k)) / distance(&undistorted));
+        }
+    }
+    largest
 }
 
 impl Extended {
