@@ -82,7 +82,7 @@ impl Assembled {
         };
         recorder.enter(Stage::Classify);
         let mut judged = seed.judged.take().unwrap_or_else(|| reconstruction.judged(problem, &seed, recorder));
-        if reconstruction.grade == Grade::Metric && seed.decided.is_none() {
+        if reconstruction.is_metric() && seed.judges_observations() && seed.decided.is_none() {
             let contradicted = judged.contradicted_views(problem);
             if !contradicted.is_empty() {
                 reconstruction.leave_out(contradicted);
@@ -244,6 +244,9 @@ impl Reconstruction {
             let intrinsics = (*intrinsics)?;
             if !problem.has_own_focals() {
                 return Some(pixel_calibration(&intrinsics, outcome, problem, view));
+            }
+            if determined.is_empty() {
+                return None;
             }
             let own: Vec<usize> = determined.iter().copied().filter(|&view| group_of[view] == group).collect();
             let focal = mean(if own.is_empty() { &determined } else { &own });

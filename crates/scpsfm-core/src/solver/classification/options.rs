@@ -3,7 +3,7 @@
 options! {
     /// How tracks are judged by their residuals.
     pub struct ClassificationOptions {
-        /// Share of the observations of right tracks that a view must keep under a METRIC calibration. Views of a second
+        /// Share of the observations of right tracks that a view must keep under a calibration. Views of a second
         /// camera that was not declared kept .09 to .17 in one scene and .19 to .58 in another; the views of the first
         /// 120 scenes of `evaluate --photographed`, up to 70 % of whose tracks are wrong, .46 and more.
         least_kept_share: f64 = 0.33,
