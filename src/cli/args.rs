@@ -100,6 +100,18 @@ pub fn parse_positive(text: &str) -> Result<f64, String> {
     if number.is_finite() && number > 0.0 { Ok(number) } else { Err("is not positive and finite".into()) }
 }
 
+/// A number within a range.
+///
+/// # Errors
+/// For anything else.
+pub fn parse_number_within((least, most): (f64, f64)) -> impl Fn(&str) -> Result<f64, String> + Clone {
+    move |text| match text.parse() {
+        Ok(number) if (least..=most).contains(&number) => Ok(number),
+        Ok(_) => Err(format!("is not in {least:e}..={most:e}")),
+        Err(_) => Err("is not a number".to_owned()),
+    }
+}
+
 /// Threads that solve at a time where nothing is said: one a core.
 pub fn cores() -> usize {
     Threads::one_a_core().count()

@@ -65,6 +65,11 @@ pub struct Failure {
     pub message: String,
 }
 
+/// The flag with the name of a field: `--noise-px` of `job.settings.noise_px`.
+pub fn flag_named(field: &str) -> String {
+    format!("--{}", field.rsplit('.').next().unwrap_or_default().replace('_', "-"))
+}
+
 impl Failure {
     fn new(exit: Exit, message: impl fmt::Display) -> Self {
         Self { exit, message: message.to_string() }
@@ -80,10 +85,7 @@ impl Failure {
 
     /// Options out of range, by the flags that have their names: `--noise-px: ...`.
     pub fn of_flags(invalid: &InvalidInput) -> Self {
-        let of_flag = |violation: &Violation| {
-            let option = violation.field.rsplit('.').next().unwrap_or_default();
-            format!("--{}: {}", option.replace('_', "-"), violation.description)
-        };
+        let of_flag = |violation: &Violation| format!("{}: {}", flag_named(&violation.field), violation.description);
         Self::usage(invalid.violations().iter().map(of_flag).collect::<Vec<_>>().join("; "))
     }
 

@@ -4,7 +4,7 @@ use std::path::{Path, PathBuf};
 
 use clap::{Args, ValueEnum};
 
-use super::args::{parse_positive, parse_whole};
+use super::args::{parse_number_within, parse_whole};
 use super::exit::Failure;
 use super::shell::quoted;
 use crate::domain::{FocalPrior, ImageSize, Limits};
@@ -75,10 +75,12 @@ pub struct ReadingArgs {
 
     /// Focal length of every view in pixels, known beforehand (EXIF, the lens): it counts as one more observation, and
     /// replaces what a COLMAP database knows
-    #[arg(long, help_heading = READING, value_name = "PX", value_parser = parse_positive)]
+    #[arg(long, help_heading = READING, value_name = "PX",
+        value_parser = parse_number_within(FocalPrior::FOCAL_RANGE_PX))]
     pub focal_px: Option<f64>,
 
-    #[arg(long, help_heading = READING, value_name = "SIGMA", requires = "focal_px", value_parser = parse_positive,
+    #[arg(long, help_heading = READING, value_name = "SIGMA", requires = "focal_px",
+        value_parser = parse_number_within(FocalPrior::SIGMA_LOG_RANGE),
         help = format!("One standard deviation of log(--focal-px), a relative error: .1 is 10 % \
         [default: {FOCAL_SIGMA_LOG}]"))]
     pub focal_sigma: Option<f64>,

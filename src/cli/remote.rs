@@ -3,7 +3,7 @@
 use prost::Message as _;
 
 use super::access::with_flag;
-use super::exit::{Exit, Failure};
+use super::exit::{Exit, Failure, flag_named};
 use crate::client::{Error, ErrorKind, InputData, Setting};
 use crate::domain::Violation;
 use crate::formats::LabelledInput;
@@ -40,7 +40,7 @@ impl From<Error> for Failure {
         };
         let mut message = match error.setting {
             Some(setting) => with_flag(&error.message, setting),
-            None => error.message,
+            None => in_terms_of_flags(error.message, &error.violations),
         };
         if (error.kind, error.setting) == (ErrorKind::Unavailable, Some(Setting::Server)) {
             message.push_str("; `scpsfm serve` starts one, --server or SCPSFM_SERVER names another");
@@ -53,6 +53,29 @@ impl From<Error> for Failure {
         }
         Failure { exit, message }
     }
+}
+
+/// A message of the server with the fields that flags set told as the flags.
+fn in_terms_of_flags(message: String, violations: &[Violation]) -> String {
+    let told = violations.iter().filter_map(|found| Some((found.path(), flag_of(&found.field)?)));
+    told.fold(message, |message, (path, flag)| {
+        let rest = message.strip_prefix(&format!("{path}: ")).map(|rest| format!("{flag}: {rest}"));
+        rest.unwrap_or_else(|| message.replacen(&format!("; {path}: "), &format!("; {flag}: "), 1))
+    })
+}
+
+/// The flag that sets a field; `None` of one that no flag sets.
+fn flag_of(field: &str) -> Option<String> {
+    Some(match field {
+        "after_sequence" => "--after".to_owned(),
+        "deadline" | "job.time_limit" => "--time-limit".to_owned(),
+        "job.labels" => "--label".to_owned(),
+        "job.webhook" | "job.webhook.url" => "--webhook".to_owned(),
+        "parent" => "--tenant".to_owned(),
+        "job.settings.use_daq" => "--no-daq".to_owned(),
+        "filter" | "job_id" | "job.priority" | "page_size" | "page_token" | "request_id" => flag_named(field),
+        _ => field.starts_with("job.settings.").then(|| flag_named(field))?,
+    })
 }
 
 /// Tells what is wrong with the input by file and line: the server speaks of fields and indices, the user has lines.
@@ -119,6 +142,27 @@ mod tests {
             assert_eq!(exit(of(input)), Exit::BadInput, "{input}");
         }
         assert_eq!(exit(Vec::new()), Exit::BadInput, "a malformed message");
+    }
+
+    #[test]
+    fn fields_are_told_as_the_flags_that_set_them() {
+        for (violations, message, told) in [
+            (
+                vec![Violation::of("job_id", "is no id"), Violation::at("job.labels", 2, "is empty")],
+                "job_id: is no id; job.labels[2]: is empty",
+                "--job-id: is no id; --label: is empty",
+            ),
+            (vec![Violation::of("job.webhook.url", "is no URL")], "job.webhook.url: is no URL", "--webhook: is no URL"),
+            (vec![Violation::of("deadline", "is over")], "deadline: is over", "--time-limit: is over"),
+            (vec![Violation::of("name", "is no name")], "name: is no name", "name: is no name"),
+            (
+                vec![Violation::at("track_set.xs", 3, "is not finite")],
+                "track_set.xs[3]: is not finite",
+                "track_set.xs[3]: is not finite",
+            ),
+        ] {
+            assert_eq!(Failure::from(Error { violations, ..error(ErrorKind::Invalid, message) }).message, told);
+        }
     }
 
     #[test]
