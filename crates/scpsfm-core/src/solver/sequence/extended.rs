@@ -68,7 +68,12 @@ pub fn extend(problem: &Problem, seed: Attempt, recorder: &mut Recorder) -> Resu
     }
     for (outcome, magnification) in calibrations.iter_mut().zip(magnifications(problem, &model)) {
         if magnification > OPTIONS.most_magnification {
-            refuse(outcome, format!("the lens would move observations outwards by a factor of {magnification:.1}"));
+            let detail = format!(
+                "the lens would move observations outwards by a factor of {magnification:.2}, which with depth in the \
+                 scene is rather a camera that turned behind a barrel lens; the most that is believed is {}",
+                OPTIONS.most_magnification
+            );
+            refuse(outcome, detail);
         }
     }
     problem.stopped()?;
@@ -84,9 +89,13 @@ fn refuse(outcome: &mut Outcome, detail: String) {
 }
 
 /// Largest factor by which the lens of each camera moves an observation that it keeps away from the principal point, 1
-/// at least. Views whose focal length is not determined say nothing of their lens.
+/// at least, and of a camera that only turned, whose scene has no depth to take up what its lens does. Views whose focal
+/// length is not determined say nothing of their lens.
 fn magnifications(problem: &Problem, model: &Model) -> Vec<f64> {
     let mut largest = vec![1.0f64; problem.cameras];
+    if model.has_common_centre {
+        return largest;
+    }
     for k in (0..model.kept.len()).filter(|&k| model.kept[k]) {
         let view = problem.view_of(k);
         let lens = model.intrinsics_of(problem, view);

@@ -297,6 +297,26 @@ fn a_turning_barrel_lens_is_not_taken_for_a_pincushion_lens() {
     }
 }
 
+/// A pincushion lens that moves observations far outwards is right where the camera only turned.
+#[test]
+fn a_turning_pincushion_lens_is_calibrated() {
+    for (seed, radial_k1) in (1..=3).flat_map(|seed| [0.1, 0.3].map(|k1| (seed, k1))) {
+        let options = SceneOptions {
+            motion: Motion::PureRotation,
+            radial_k1,
+            noise: 0.0005,
+            outliers: 0.3,
+            seed,
+            ..SceneOptions::default()
+        };
+        let (input, scene) = scene(options);
+        let solution = solved(&input, &SolveSettings::default());
+        println!("seed {seed}, k1 {radial_k1}: {:?} {:?}", solution.grade, solution.warnings);
+        assert_eq!(solution.grade, Some(Grade::Metric), "seed {seed}, k1 {radial_k1}");
+        assert!(focal_error(&solution, &scene) < 0.01, "seed {seed}, k1 {radial_k1}");
+    }
+}
+
 /// A camera that does not turn behind a lens that is no equidistant fisheye: what its distortion says of the focal
 /// length is not told as more certain than it is.
 #[test]
