@@ -98,6 +98,7 @@ pub fn at_lines_of(mut error: Error, inputs: &[LabelledInput]) -> Failure {
         _ => None,
     });
     error.violations = own.collect();
+    error.message = error.message.trim_start_matches(&format!("requests[{index}]: ")).to_owned();
     at_lines(error, input)
 }
 

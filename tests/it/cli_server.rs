@@ -137,12 +137,12 @@ fn flags_that_only_a_server_can_refuse_are_wrong_usage() {
     let serving = Serving::start(&directory.path().join("data"));
     let long_key = format!("{}=x", "k".repeat(64));
     let cases: [(&[&str], &str); 8] = [
-        (&["submit", input, "--label", &long_key], "job.labels"),
-        (&["submit", input, "--job-id", "A"], "job_id"),
-        (&["submit", input, "--request-id", "a b"], "request_id"),
-        (&["submit", input, "--time-limit", "1e15"], "job.time_limit"),
-        (&["list", "--filter", "colour = red"], "filter"),
-        (&["list", "--page-token", "made-up"], "page_token"),
+        (&["submit", input, "--label", &long_key], "error: --label: "),
+        (&["submit", input, "--job-id", "A"], "error: --job-id: "),
+        (&["submit", input, "--request-id", "a b"], "error: --request-id: "),
+        (&["submit", input, "--time-limit", "1e15"], "error: --time-limit: "),
+        (&["list", "--filter", "colour = red"], "error: --filter: "),
+        (&["list", "--page-token", "made-up"], "error: --page-token: "),
         (&["list", "--server", "localhost:1"], "--server \"localhost:1\" has no scheme: put http:// in front"),
         (&["list", "--server", "ftp://localhost:1"], "http://HOST:PORT"),
     ];
