@@ -92,6 +92,8 @@ pub fn solve_behind(
     }
     let quick = QuickPass::new(problem, recorder)?;
     let found = quick.result();
+    // Seeds gain by a lens by chance, and the whole then explains no more: three translations had .99 to 1.00 of what
+    // they had without, three scenes behind real lenses 1.14 to 1.33 times as much.
     let explains_more = found.evidence(problem) > of_pinholes.evidence(problem);
     if found.calibrated_extension(problem).is_none() && found.holds_most_views() && !explains_more {
         problem.undone = None;
