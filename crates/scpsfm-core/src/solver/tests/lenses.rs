@@ -253,12 +253,10 @@ fn fisheye(motion: PhotographedMotion, seed: u64) -> PhotographedOptions {
     }
 }
 
-/// A scene with depth, a turning camera, a plane, and a camera that does not turn, whose distortion alone tells the
-/// focal length; without a search behind lenses the turning one and the last are refused.
+/// A scene with depth, a turning camera and a plane; the turning camera is refused without a search behind lenses.
 #[test]
 fn a_fisheye_is_found_and_calibrated() {
-    use PhotographedMotion::{Orbit, PlanarScene, PureRotation, Translation};
-    for motion in [Orbit, PureRotation, PlanarScene, Translation] {
+    for motion in [PhotographedMotion::Orbit, PhotographedMotion::PureRotation, PhotographedMotion::PlanarScene] {
         for seed in 0..3 {
             let scene = Photographed::generate(&fisheye(motion, seed)).expect("valid options");
             let input = Input::new(scene.input.clone(), &Limits::default(), "scene").expect("valid input");
@@ -314,6 +312,24 @@ fn a_turning_pincushion_lens_is_calibrated() {
         println!("seed {seed}, k1 {radial_k1}: {:?} {:?}", solution.grade, solution.warnings);
         assert_eq!(solution.grade, Some(Grade::Metric), "seed {seed}, k1 {radial_k1}");
         assert!(focal_error(&solution, &scene) < 0.01, "seed {seed}, k1 {radial_k1}");
+    }
+}
+
+/// The distortion of a fisheye tells its focal length where the camera does not turn. These were PROJECTIVE_ONLY.
+#[test]
+fn a_camera_that_does_not_turn_is_calibrated_behind_a_fisheye() {
+    for seed in [820_140, 820_253, 820_776] {
+        let options = PhotographedOptions::drawn(seed);
+        assert_eq!((options.motion, options.lens), (PhotographedMotion::Translation, LensKind::Fisheye), "seed {seed}");
+        let scene = Photographed::generate(&options).expect("valid options");
+        let input = Input::new(scene.input.clone(), &Limits::default(), "scene").expect("valid input");
+        let solution = solved(&input, &SolveSettings::default());
+        println!("seed {seed}: {:?} {:?}", solution.grade, solution.warnings);
+        assert_eq!(solution.grade, Some(Grade::Metric), "seed {seed}");
+        for (error, sigma) in errors_of_cameras(&solution, &scene) {
+            println!("  off by {error:.5}, sigma {sigma:.5}");
+            assert!(error < 4.0 * sigma, "seed {seed}: {error} for {sigma}");
+        }
     }
 }
 
