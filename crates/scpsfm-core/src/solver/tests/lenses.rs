@@ -272,21 +272,18 @@ fn a_fisheye_is_found_and_calibrated() {
     }
 }
 
+/// A camera that only turned, three of ten tracks wrong.
+fn turning(seed: u64, radial_k1: f64) -> SceneOptions {
+    let motion = Motion::PureRotation;
+    SceneOptions { motion, radial_k1, noise: 0.0005, outliers: 0.3, seed, ..SceneOptions::default() }
+}
+
 /// A camera that turns behind a strong barrel lens: one that moves about a bowl behind a pincushion lens fits nearly as
 /// well. It was METRIC, off by a factor of 2.3.
 #[test]
 fn a_turning_barrel_lens_is_not_taken_for_a_pincushion_lens() {
     for (seed, radial_k1) in (4..=6).flat_map(|seed| [-0.45, -0.5].map(|k1| (seed, k1))) {
-        let options = SceneOptions {
-            motion: Motion::PureRotation,
-            radial_k1,
-            focal_range_px: (900.0, 900.0),
-            noise: 0.0005,
-            outliers: 0.3,
-            seed,
-            ..SceneOptions::default()
-        };
-        let (input, scene) = scene(options);
+        let (input, scene) = scene(SceneOptions { focal_range_px: (900.0, 900.0), ..turning(seed, radial_k1) });
         let solution = solved(&input, &SolveSettings::default());
         let calibration = solution.calibrations.first();
         println!("seed {seed}, k1 {radial_k1}: {:?} {calibration:?} {:?}", solution.grade, solution.warnings);
@@ -299,15 +296,7 @@ fn a_turning_barrel_lens_is_not_taken_for_a_pincushion_lens() {
 #[test]
 fn a_turning_pincushion_lens_is_calibrated() {
     for (seed, radial_k1) in (1..=3).flat_map(|seed| [0.1, 0.3].map(|k1| (seed, k1))) {
-        let options = SceneOptions {
-            motion: Motion::PureRotation,
-            radial_k1,
-            noise: 0.0005,
-            outliers: 0.3,
-            seed,
-            ..SceneOptions::default()
-        };
-        let (input, scene) = scene(options);
+        let (input, scene) = scene(turning(seed, radial_k1));
         let solution = solved(&input, &SolveSettings::default());
         println!("seed {seed}, k1 {radial_k1}: {:?} {:?}", solution.grade, solution.warnings);
         assert_eq!(solution.grade, Some(Grade::Metric), "seed {seed}, k1 {radial_k1}");
@@ -333,29 +322,21 @@ fn a_camera_that_does_not_turn_is_calibrated_behind_a_fisheye() {
     }
 }
 
-/// A camera that does not turn behind a lens that is no equidistant fisheye: what its distortion says of the focal
-/// length is not told as more certain than it is.
+/// A perspective lens leaves the focal length free where the camera does not turn, however much it distorts: it is not
+/// to be taken for a fisheye, whose distortion would tell it.
 #[test]
-fn a_translation_behind_another_lens_is_not_metric_and_wrong() {
-    let lenses = [
-        (LensKind::Barrel, 1400.0, [-0.12, 0.0]),
-        (LensKind::ActionCamera, 1100.0, [-0.25, 0.05]),
-        (LensKind::Fisheye, 764.0, [0.03, 0.0]),
-        (LensKind::Fisheye, 764.0, [-0.03, 0.0]),
-    ];
-    for (lens, focal_px, radial) in lenses {
+fn a_translation_behind_a_barrel_lens_is_not_metric() {
+    for (lens, focal_px, radial) in
+        [(LensKind::Barrel, 1400.0, [-0.12, 0.0]), (LensKind::ActionCamera, 1100.0, [-0.25, 0.05])]
+    {
         for seed in 0..3 {
             let options =
                 PhotographedOptions { lens, focal_px, radial, ..fisheye(PhotographedMotion::Translation, seed) };
             let scene = Photographed::generate(&options).expect("valid options");
             let input = Input::new(scene.input.clone(), &Limits::default(), "scene").expect("valid input");
             let solution = solved(&input, &SolveSettings::default());
-            let calibration = solution.calibrations.first();
-            println!("{lens:?} {radial:?}, seed {seed}: {:?} {calibration:?}", solution.grade);
-            let Some(calibration) = calibration else { continue };
-            let error = (calibration.focal_px / focal_px).ln().abs();
-            let sigma = calibration.sigma_log_focal.unwrap_or(f64::INFINITY);
-            assert!(error < 4.0 * sigma, "{lens:?} {radial:?}, seed {seed}: {error} at {sigma}");
+            println!("{lens:?}, seed {seed}: {:?} {:?}", solution.grade, solution.calibrations.first());
+            assert_ne!(solution.grade, Some(Grade::Metric), "{lens:?}, seed {seed}: {:?}", solution.calibrations);
         }
     }
 }
