@@ -52,6 +52,11 @@ impl Parameter {
         Self::TangentialP1,
         Self::TangentialP2,
     ];
+
+    /// Whether it bends rays, which no pinhole does.
+    pub fn is_of_lens(self) -> bool {
+        self as usize >= Self::RadialK1 as usize
+    }
 }
 
 /// Intrinsics in normalised image units, without skew, behind a lens that distorts.

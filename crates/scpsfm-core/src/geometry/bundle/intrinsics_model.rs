@@ -43,7 +43,7 @@ impl Extension {
 
     /// Whether it bends rays, which no pinhole does.
     pub fn is_of_lens(self) -> bool {
-        !matches!(self, Extension::PrincipalPoint | Extension::Aspect)
+        self.parameters().iter().any(|parameter| parameter.is_of_lens())
     }
 
     /// What it frees, in words.

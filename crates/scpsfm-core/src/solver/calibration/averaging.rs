@@ -47,10 +47,14 @@ impl Choice<'_> {
     /// with distortion once for each kind of lens. An extension that the data can neither confirm nor refute thus costs
     /// what it would move.
     ///
+    /// The same models behind lenses of the other projection take part where that was tried, as probable beforehand;
+    /// poses and points are taken to be known alike behind either. The terms of distortion are averaged over the models
+    /// of the best one's projection: in the other they are those of another series.
+    ///
     /// * `priors`: those of the best model, or without what is known of a focal length
     /// * `inflation`: factor on all of them, for what a linearisation with independent noise does not see
     pub fn sigmas(&self, selection: &Selection, priors: &[IntrinsicsPrior], inflation: f64) -> Sigmas {
-        let best = &selection.best;
+        let Selection { best, tried } = selection;
         let views = best.minimum.reconstruction.focals.len();
         let here = best.sigma_log_focal().and_then(|_| best.optimum(best.model, priors));
         let Some(here) = here else {
@@ -58,47 +62,59 @@ impl Choice<'_> {
             return Sigmas { of_group, view_focals: vec![None; views] };
         };
         let unit = best.fit.noise.powi(2);
-        let models: Vec<Weighed> =
-            best.model.with_any_extensions().flat_map(|model| self.weighed(selection, model, priors)).collect();
+        let other = tried.iter().find(|tried| !tried.has_projections_of(best));
+        let models: Vec<Weighed> = std::iter::once(best)
+            .chain(other)
+            .flat_map(|like| best.model.with_any_extensions().map(move |model| (like, model)))
+            .flat_map(|(like, model)| self.weighed(selection, like, model, priors))
+            .collect();
         let highest = models.iter().map(|model| model.log_weight).fold(f64::NEG_INFINITY, f64::max);
         let weights: Vec<f64> = models.iter().map(|model| (model.log_weight - highest).exp()).collect();
-        let total: f64 = weights.iter().sum();
-        // Of what has this variance and value under each model, and this value under the best.
-        let averaged = |of_models: &mut dyn Iterator<Item = (Option<f64>, f64)>, here: f64| {
-            let mut squared = 0.0;
-            for (weight, (variance, value)) in weights.iter().map(|weight| weight / total).zip(of_models) {
+        // Of what has this weight, variance and value under each model, and this value under the best.
+        let averaged = |of_models: &mut dyn Iterator<Item = (f64, (Option<f64>, f64))>, here: f64| {
+            let (mut total, mut unknown, mut squared) = (0.0, 0.0, 0.0);
+            for (weight, (variance, value)) in of_models {
+                total += weight;
                 match variance {
                     Some(variance) => squared += weight * (variance * unit + (value - here).powi(2)),
-                    None if weight > self.problem.options.models.negligible => return None,
-                    None => {}
+                    None => unknown = f64::max(unknown, weight),
                 }
             }
-            Some(squared.sqrt() * inflation).filter(|sigma| sigma.is_finite())
+            let sigma = (squared / total).sqrt() * inflation;
+            Some(sigma).filter(|sigma| sigma.is_finite() && unknown <= self.problem.options.models.negligible * total)
         };
         let free = best.model.parameters();
         let of_parameter = |group: usize, parameter: Parameter| {
             let is_free = free.contains(&parameter) || (views > 0 && parameter == Parameter::LogFocal);
+            let is_comparable = |from: &Candidate| !parameter.is_of_lens() || from.has_projections_of(best);
             let value =
                 |from: &Candidate, optimum: &Optimum| from.value(group, parameter) + optimum.shift_of(group, parameter);
-            let mut of_models = models
-                .iter()
-                .map(|Weighed { from, optimum, .. }| (optimum.variance_of(group, parameter), value(from, optimum)));
-            averaged(&mut of_models, value(best, &here)).filter(|_| is_free)
+            let of_model = |(&weight, Weighed { from, optimum, .. }): (&f64, &Weighed)| {
+                let found = (optimum.variance_of(group, parameter), value(from, optimum));
+                is_comparable(from).then_some((weight, found))
+            };
+            averaged(&mut weights.iter().zip(&models).filter_map(of_model), value(best, &here)).filter(|_| is_free)
         };
         let groups = 0..self.problem.groups();
         let of_group = groups.map(|group| Parameter::ALL.map(|parameter| of_parameter(group, parameter))).collect();
         let here = best.own_focals(&here);
         let there: Vec<_> = models.iter().map(|model| model.from.own_focals(&model.optimum)).collect();
-        let of_view = |view: usize| averaged(&mut there.iter().map(|of_views| of_views[view]), here[view].1);
+        let of_view = |view: usize| {
+            let of_models = weights.iter().zip(&there).map(|(&weight, of_views)| (weight, of_views[view]));
+            averaged(&mut { of_models }, here[view].1)
+        };
         Sigmas { of_group, view_focals: (0..views).map(of_view).collect() }
     }
 
-    /// A model for each kind of lens that it may be of, from the candidate that was adjusted with most nearly the same
-    /// extensions: where the observations are weak, a linearisation predicts only half of the gain that an
-    /// adjustment finds.
+    /// A model for each kind of lens that it may be of, from the candidate of one projection that was adjusted with most
+    /// nearly the same extensions: where the observations are weak, a linearisation predicts only half of the gain that
+    /// an adjustment finds.
+    ///
+    /// * `like`: one of that projection
     fn weighed<'c>(
         &self,
         selection: &'c Selection,
+        like: &Candidate,
         model: IntrinsicsModel,
         priors: &[IntrinsicsPrior],
     ) -> Vec<Weighed<'c>> {
@@ -109,8 +125,11 @@ impl Choice<'_> {
         };
         // A richer model may have ended in another minimum, behind the cameras.
         let least = self.problem.options.grades.least_in_front.min(best.minimum.cheirality);
-        let is_like = |tried: &&Candidate| tried.information.is_some() && tried.minimum.cheirality >= least;
-        let adjusted = std::iter::once(best).chain(tried.iter().rev().filter(is_like));
+        let is_like = |tried: &&Candidate| {
+            let stands = tried.information.is_some() && tried.minimum.cheirality >= least;
+            stands && tried.has_projections_of(like)
+        };
+        let adjusted = std::iter::once(best).chain(tried.iter().rev()).filter(is_like);
         let Some(from) = adjusted.min_by_key(|candidate| differing(candidate)) else { return Vec::new() };
         let of_kind = |(share, narrowing): (f64, f64)| {
             let narrowed = |prior: &IntrinsicsPrior| prior.narrowed(Parameter::RadialK1, narrowing);

@@ -137,21 +137,19 @@ fn chosen(
     let simplest = IntrinsicsModel::focal(first.reconstruction.has_own_focals());
     let mut of_model = Vec::new();
     let simple = Candidate::new(first, simplest, choice.priors(fit.noise), problem);
-    let mut found = choice.richest(simple, &mut of_model)?;
-    let fisheye = choice.behind_fisheyes(&found.best, &mut minima)?;
-    let is_simplest = fisheye.is_none() && found.best.model == simplest;
-    if let Some(fisheye) = fisheye {
-        (found, of_model) = fisheye;
-    }
+    let found = choice.richest(simple, &mut of_model)?;
+    // Of the simplest model no projection is replaced, and the minima are its own.
+    let is_simplest = found.best.model == simplest;
+    let (mut found, of_model) = choice.with_other_projection(found, &mut minima, of_model)?;
     warnings.extend(of_model);
     if is_simplest {
         return Ok((found, minima));
     }
-    let Selection { best, tried } = &mut found;
     let least_in_front = problem.options.grades.least_in_front;
     let mut others = Vec::with_capacity(minima.len());
     for start in minima {
         Error::check(choice.stop)?;
+        let best = &found.best;
         let search = choice.search(&best.priors);
         let Some(mut minimum) = search.converged_near(start.reconstruction, best.model, best.minimum.cost) else {
             continue;
@@ -159,8 +157,7 @@ fn chosen(
         // A model that is wrong may rank the minima wrongly.
         if minimum.cost < best.minimum.cost && minimum.cheirality >= least_in_front.min(best.minimum.cheirality) {
             let better = Candidate::new(minimum.clone(), best.model, best.priors.clone(), problem);
-            minimum = std::mem::replace(best, better).minimum;
-            tried.clear();
+            minimum = found.replace(better).minimum;
         }
         others.push(minimum);
     }

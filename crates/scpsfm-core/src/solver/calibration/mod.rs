@@ -256,15 +256,16 @@ pub fn from_metric(
     let undistorted = is_fisheye.then(|| misfit::undistorted(of_stretch, on.observations));
     let on = &Uncalibrated { observations: undistorted.as_deref().unwrap_or(on.observations), ..*on };
     let Compared { fit, critical, mut warnings, .. } = Compared::new(problem, on, scale_px, stop, heartbeat)?;
-    // Its distortion tells the focal length of a fisheye, whether it turns or not.
-    let tells_focal = is_fisheye && !metric.has_common_centre && matches!(critical.upgrade, Upgrade::Translation(_));
-    if !tells_focal {
-        warnings.extend(critical.warnings);
-    }
+    // The distortion of a fisheye may tell the focal length of a camera that did not turn, and the motion is no reason
+    // for a refusal then.
+    let may_tell_focal = is_fisheye && !metric.has_common_centre && matches!(critical.upgrade, Upgrade::Translation(_));
+    let (of_motion, of_refusal) =
+        if may_tell_focal { (Vec::new(), critical.warnings) } else { (critical.warnings, Vec::new()) };
+    warnings.extend(of_motion);
     let fit = match (critical.upgrade, metric.has_common_centre) {
         (Upgrade::Rotation { free, .. }, true) => free,
         (Upgrade::Quadric(_) | Upgrade::Plane(_), false) => fit,
-        (Upgrade::Translation(_), false) if tells_focal => fit,
+        (Upgrade::Translation(_), _) if may_tell_focal => fit,
         (upgrade, has_common_centre) => {
             let detail = match (upgrade, has_common_centre) {
                 (Upgrade::Rotation { .. }, _) => "the views together are those of a camera that only turned",
@@ -291,7 +292,11 @@ pub fn from_metric(
         warnings.push(no_start());
         return Ok(problem.refused(&warnings));
     }
-    grading::grade(&choice, &fit, stretch, minima, warnings)
+    let mut outcomes = grading::grade(&choice, &fit, stretch, minima, warnings)?;
+    for outcome in outcomes.iter_mut().filter(|outcome| outcome.grade == Grade::ProjectiveOnly) {
+        outcome.warnings.splice(0..0, of_refusal.iter().cloned());
+    }
+    Ok(outcomes)
 }
 
 /// The log focal length that a metric reconstruction has by these observations alone, the mean of those of its views

@@ -2,7 +2,7 @@
 
 use super::Uncalibrated;
 use super::fit::Fit;
-use super::options::{CalibrationOptions, GradeOptions};
+use super::options::{CalibrationOptions, GradeOptions, ModelOptions};
 use super::search::{Minimum, Search};
 use crate::domain::{FocalPrior, StopToken, Warning, WarningCode};
 use crate::geometry::bundle::metric::{
@@ -70,7 +70,13 @@ impl Candidate {
         of_views.map(|((variance, shift), focal)| (variance, focal.ln() + shift)).collect()
     }
 
-    /// The same of one group.
+    /// Whether each group's lens is of the same projection as the other's.
+    pub fn has_projections_of(&self, other: &Self) -> bool {
+        let [own, others] = [self, other].map(|candidate| candidate.minimum.reconstruction.intrinsics.iter());
+        own.zip(others).all(|(own, other)| own.projection == other.projection)
+    }
+
+    /// Standard deviation of the log focal length of one group if the model is right.
     fn sigma_of_focal(&self, group: usize) -> Option<f64> {
         self.sigma(group, Parameter::LogFocal, self.model, &self.priors)
     }
@@ -79,8 +85,18 @@ impl Candidate {
 /// The model that was chosen, and what else was adjusted on the way.
 pub(super) struct Selection {
     pub best: Candidate,
-    /// Simpler models, and richer ones that were not taken, of the same minimum.
+    /// Simpler models, and richer ones that were not taken, of the same minimum, and all of them behind lenses of the
+    /// other projection.
     pub tried: Vec<Candidate>,
+}
+
+impl Selection {
+    /// Puts another minimum in place of the best, of which nothing else was adjusted; returns what was the best. What
+    /// was tried of the other projection is kept: it explains the same observations.
+    pub fn replace(&mut self, better: Candidate) -> Candidate {
+        self.tried.retain(|tried| !tried.has_projections_of(&better));
+        std::mem::replace(&mut self.best, better)
+    }
 }
 
 /// What the choice of a model works with.
@@ -161,50 +177,75 @@ impl Choice<'_> {
         }
     }
 
-    /// The richest candidate behind fisheyes instead of this one's barrels, with what is to be warned of, where the
-    /// chi-square falls by a significant gain for the other projection and for each parameter more; it may rise by as
-    /// much for each parameter fewer. The two series of distortion are not nested.
+    /// The selection with lenses of the other projection tried, where they may stand in the place of those that were
+    /// found, and its warnings, which are of the best.
     ///
-    /// * `minima`: others, put behind fisheyes where those are taken
-    pub fn behind_fisheyes(
+    /// Fisheyes in the place of wide barrels become the best where the chi-square falls by a significant gain for the
+    /// other projection and for each parameter more. It may rise by as much for each parameter fewer: the two series of
+    /// distortion are not nested. Perspective lenses in the place of fisheyes only take part in sigma: the observations
+    /// are those that fit behind the fisheye.
+    ///
+    /// * `minima`: others, put behind fisheyes where those become the best
+    pub fn with_other_projection(
         &self,
-        best: &Candidate,
+        mut found: Selection,
         minima: &mut [Minimum],
-    ) -> Result<Option<(Selection, Vec<Warning>)>, Error> {
-        let radii = self.wide_barrels(&best.minimum.reconstruction);
-        if radii.iter().all(Option::is_none) {
-            return Ok(None);
+        warnings: Vec<Warning>,
+    ) -> Result<(Selection, Vec<Warning>), Error> {
+        let ModelOptions { fisheye_from, perspective_up_to, significant_gain_of_one, .. } = self.problem.options.models;
+        let best = &found.best;
+        let may_be_fisheye =
+            |lens: &Intrinsics, radius: f64| !lens.is_fisheye() && lens.radial[0] < 0.0 && radius > fisheye_from;
+        if let Some(radii) = self.radii(&best.minimum.reconstruction, may_be_fisheye) {
+            let fisheye = |group: usize, lens: &Intrinsics| {
+                radii[group].map_or_else(|| lens.simplest(), |radius| lens.nearest_fisheye(radius))
+            };
+            let simplest = IntrinsicsModel::focal(best.model.is_per_view());
+            let from = best.minimum.with_lenses(fisheye);
+            let mut of_fisheyes = Vec::new();
+            let other = self.richest(self.adjusted(&from, simplest, best.fit.noise), &mut of_fisheyes)?;
+            let parameters = |candidate: &Candidate| candidate.model.parameters().len() as f64;
+            let added = 1.0 + (parameters(&other.best) - parameters(best)) * self.problem.groups() as f64;
+            let gain = (best.fit.cost - other.best.fit.cost) / best.fit.noise.min(other.best.fit.noise).powi(2);
+            if gain <= added * significant_gain_of_one {
+                found.tried.extend(other.tried.into_iter().chain([other.best]));
+                return Ok((found, warnings));
+            }
+            minima.iter_mut().for_each(|minimum| *minimum = minimum.with_lenses(fisheye));
+            let Selection { best, mut tried } = other;
+            tried.extend(found.tried.into_iter().chain([found.best]));
+            return Ok((Selection { best, tried }, of_fisheyes));
         }
-        let from = best.minimum.behind_fisheyes(&radii);
-        let simplest = IntrinsicsModel::focal(best.model.is_per_view());
-        let mut warnings = Vec::new();
-        let found = self.richest(self.adjusted(&from, simplest, best.fit.noise), &mut warnings)?;
-        let parameters = |candidate: &Candidate| candidate.model.parameters().len() as f64;
-        let added = 1.0 + (parameters(&found.best) - parameters(best)) * self.problem.groups() as f64;
-        let gain = (best.fit.cost - found.best.fit.cost) / best.fit.noise.min(found.best.fit.noise).powi(2);
-        if gain <= added * self.problem.options.models.significant_gain_of_one {
-            return Ok(None);
+        let may_be_perspective = |lens: &Intrinsics, radius: f64| lens.is_fisheye() && radius < perspective_up_to;
+        if let Some(radii) = self.radii(&best.minimum.reconstruction, may_be_perspective) {
+            let from = best
+                .minimum
+                .with_lenses(|group, lens| radii[group].map_or(*lens, |radius| lens.nearest_perspective(radius)));
+            let radial = [Extension::RadialK1, Extension::RadialK2, Extension::RadialK3];
+            let model = radial.into_iter().fold(best.model, IntrinsicsModel::with);
+            let other = self.adjusted(&from, model, best.fit.noise);
+            found.tried.push(other);
         }
-        minima.iter_mut().for_each(|minimum| *minimum = minimum.behind_fisheyes(&radii));
-        Ok(Some((found, warnings)))
+        Ok((found, warnings))
     }
 
-    /// The largest radius in the image at which each group behind a perspective barrel observes, where that is so wide
-    /// that a fisheye may stand in its place.
-    fn wide_barrels(&self, reconstruction: &MetricReconstruction) -> Vec<Option<f64>> {
-        let mut radii = vec![(0.0f64, 0.0f64); self.problem.groups()];
+    /// The largest radius at unit depth at which each group observes whose lens is to be replaced; `None` where none is.
+    fn radii(
+        &self,
+        reconstruction: &MetricReconstruction,
+        is_replaced: impl Fn(&Intrinsics, f64) -> bool,
+    ) -> Option<Vec<Option<f64>>> {
+        let mut radii = vec![0.0f64; self.problem.groups()];
         for seen in self.problem.observations {
-            let lens = reconstruction.intrinsics_of(seen.view);
-            if let Some(ray) = lens.ray(&seen.xy) {
-                let (imaged, at_unit_depth) = &mut radii[reconstruction.group_of[seen.view]];
-                *imaged = imaged.max((seen.xy - lens.principal_point).norm());
-                *at_unit_depth = at_unit_depth.max(ray.norm());
+            if let Some(ray) = reconstruction.intrinsics_of(seen.view).ray(&seen.xy) {
+                let of_group = &mut radii[reconstruction.group_of[seen.view]];
+                *of_group = of_group.max(ray.norm());
             }
         }
-        let is_barrel = |lens: &Intrinsics| !lens.is_fisheye() && lens.radial[0] < 0.0;
-        let least = self.problem.options.models.fisheye_from;
-        let lenses = reconstruction.intrinsics.iter().zip(radii);
-        lenses.map(|(lens, (imaged, ray))| Some(imaged).filter(|_| is_barrel(lens) && ray > least)).collect()
+        let of_lenses = reconstruction.intrinsics.iter().zip(radii);
+        let found: Vec<_> =
+            of_lenses.map(|(lens, radius)| Some(radius).filter(|_| is_replaced(lens, radius))).collect();
+        found.iter().any(Option::is_some).then_some(found)
     }
 
     /// Extensions that the linearisation predicts to be significant, with the gain beyond what is, largest first.

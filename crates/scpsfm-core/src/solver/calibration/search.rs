@@ -1,7 +1,5 @@
 //! The search for the metric reconstruction: many starts, few that converge.
 
-use nalgebra::Vector2;
-
 use super::Uncalibrated;
 use super::fit::Fit;
 use super::options::{CalibrationOptions, SearchOptions};
@@ -67,19 +65,17 @@ impl Minimum {
         if determined.contains(&true) { determined } else { vec![true; views] }
     }
 
-    /// The same behind the fisheyes that image nearest to some of its lenses, still to be adjusted, with nothing but
-    /// the focal length beside what is taken to be in order.
+    /// The same with other lenses, still to be adjusted.
     ///
-    /// * `radii`: largest radius, in the image, at which each group observes; `None` where its lens stays perspective
-    pub fn behind_fisheyes(&self, radii: &[Option<f64>]) -> Self {
+    /// * `other`: what stands in the place of the lens of a group
+    pub fn with_lenses(&self, other: impl Fn(usize, &Intrinsics) -> Intrinsics) -> Self {
         let mut found = self.clone();
         let reconstruction = &mut found.reconstruction;
-        for (lens, radius) in reconstruction.intrinsics.iter_mut().zip(radii) {
-            let of_perspective = lens.focal;
-            let ray = radius.and_then(|radius| lens.ray(&(lens.principal_point + Vector2::new(radius, 0.0))));
-            *lens = ray.map_or_else(|| lens.simplest(), |ray| lens.nearest_fisheye(ray.x));
+        for (group, lens) in reconstruction.intrinsics.iter_mut().enumerate() {
+            let before = lens.focal;
+            *lens = other(group, lens);
             // Views have focal lengths of their own only where they are of one group.
-            reconstruction.focals.iter_mut().for_each(|focal| *focal *= lens.focal / of_perspective);
+            reconstruction.focals.iter_mut().for_each(|focal| *focal *= lens.focal / before);
         }
         found
     }

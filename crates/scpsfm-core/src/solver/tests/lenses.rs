@@ -292,10 +292,11 @@ fn a_turning_barrel_lens_is_not_taken_for_a_pincushion_lens() {
     }
 }
 
-/// A pincushion lens that moves observations far outwards is right where the camera only turned.
+/// A pincushion lens that moves observations far outwards is right where the camera only turned. Homographies miss by
+/// 13 standard deviations in the last scene, which was METRIC and off by 40 %: with depth, as a camera that moved.
 #[test]
 fn a_turning_pincushion_lens_is_calibrated() {
-    for (seed, radial_k1) in (1..=3).flat_map(|seed| [0.1, 0.3].map(|k1| (seed, k1))) {
+    for (seed, radial_k1) in (1..=3).flat_map(|seed| [0.1, 0.3].map(|k1| (seed, k1))).chain([(61, 0.3)]) {
         let (input, scene) = scene(turning(seed, radial_k1));
         let solution = solved(&input, &SolveSettings::default());
         println!("seed {seed}, k1 {radial_k1}: {:?} {:?}", solution.grade, solution.warnings);
@@ -339,4 +340,11 @@ fn a_translation_behind_a_barrel_lens_is_not_metric() {
             assert_ne!(solution.grade, Some(Grade::Metric), "{lens:?}, seed {seed}: {:?}", solution.calibrations);
         }
     }
+    // An equidistant fisheye of 1.5 times the focal length bends as this barrel lens does: WEAK, off by half at 6 sigma.
+    let options = PhotographedOptions::drawn(820_818);
+    assert_eq!((options.motion, options.lens), (PhotographedMotion::Translation, LensKind::Barrel));
+    let scene = Photographed::generate(&options).expect("valid options");
+    let input = Input::new(scene.input.clone(), &Limits::default(), "scene").expect("valid input");
+    let solution = solved(&input, &SolveSettings::default());
+    assert_eq!(solution.grade, Some(Grade::ProjectiveOnly), "{:?}", solution.calibrations);
 }

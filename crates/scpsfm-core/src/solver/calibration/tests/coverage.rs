@@ -164,16 +164,6 @@ fn strange_lens(seed: u64) -> TestScene {
     scene
 }
 
-/// The calibration of a sequence that grew to where the truth is: what a search costs is left out.
-fn calibrated_from_truth(scene: &TestScene) -> Outcome {
-    let (intrinsics, poses, points) = (scene.intrinsics, scene.poses.clone(), scene.points.clone());
-    let points_in_space: Vec<Vector4<f64>> = points.iter().map(|point| point.push(1.0)).collect();
-    let cameras = scene.cameras();
-    let problem = of_one_lens(&cameras, &points_in_space, &scene.observations, STRANGE_NOISE);
-    let metric = MetricReconstruction::new(intrinsics, poses, points);
-    only(from_metric(&problem, &metric, None, SIDE_PX, &StopToken::default(), &mut || ()))
-}
-
 /// The sigmas of the other intrinsics against their errors, over 100 scenes.
 #[test]
 fn sigmas_of_the_other_intrinsics_are_about_their_errors() {
@@ -181,7 +171,7 @@ fn sigmas_of_the_other_intrinsics_are_about_their_errors() {
         ESTIMATED.into_iter().map(|parameter| (parameter, Coverage { deviations: Vec::new(), scenes: 100 })).collect();
     for seed in 0..100 {
         let scene = strange_lens(seed);
-        let outcome = calibrated_from_truth(&scene);
+        let outcome = calibrated_from_truth(&scene, STRANGE_NOISE);
         // Capped: sigma is that of the grade then.
         if outcome.grade != Grade::Metric {
             println!("seed {seed}: {:?} {:?} {:?}", outcome.grade, outcome.sigma_log_focal, codes(&outcome));

@@ -236,3 +236,48 @@ fn an_orbit_about_one_axis_leaves_the_principal_point_open() {
         assert!(codes(&outcome).contains(&"PRINCIPAL_POINT_UNOBSERVABLE"), "seed {seed}: {:?}", outcome.warnings);
     }
 }
+
+/// The terms of the other projection's series are no doubt about those of this one.
+#[test]
+fn the_sigmas_of_a_fisheyes_terms_are_of_its_own_series() {
+    for seed in 0..5 {
+        let mut scene = testing::scene(seed, 10, 200, 0.0);
+        scene.intrinsics = Intrinsics { radial: [0.1, 0.0, 0.0], ..Intrinsics::equidistant(1.0) };
+        scene.observe(0.0005, &mut rand::SeedableRng::seed_from_u64(seed));
+        scene.crop();
+        let outcome = calibrated_from_truth(&scene, 0.0005);
+        let (error, sigma) = (focal_error(&outcome, &scene), outcome.sigma_log_focal.expect("observable"));
+        let found = outcome.intrinsics().expect("metric");
+        let of_k1 = outcome.sigma(Parameter::RadialK1).expect("free");
+        println!(
+            "seed {seed}: {:?}, off by {error:.4} at {sigma:.4}, k1 {:.4} at {of_k1:.4}",
+            outcome.grade, found.radial[0]
+        );
+        assert!(outcome.grade == Grade::Metric && error < 4.0 * sigma, "seed {seed}");
+        assert!((found.radial[0] - 0.1).abs() < 4.0 * of_k1 && of_k1 < 0.05, "seed {seed}");
+    }
+}
+
+/// The distortion of a fisheye tells its focal length where the camera does not turn. Where noise hides it, the motion is
+/// the reason for the refusal.
+#[test]
+fn a_fisheye_that_does_not_turn_is_told_the_reason_where_it_is_refused() {
+    for (noise, grade) in [(0.0003, Grade::Metric), (0.005, Grade::ProjectiveOnly)] {
+        for seed in 0..3 {
+            let mut scene = testing::scene_of(seed, 10, 200, 0.0, Motion::Translation, false);
+            scene.intrinsics = Intrinsics::equidistant(1.0);
+            scene.observe(noise, &mut rand::SeedableRng::seed_from_u64(seed));
+            scene.crop();
+            let outcome = calibrated_from_truth(&scene, noise);
+            println!(
+                "noise {noise}, seed {seed}: {:?} {:?} {:?}",
+                outcome.grade,
+                outcome.sigma_log_focal,
+                codes(&outcome)
+            );
+            assert_eq!(outcome.grade, grade, "noise {noise}, seed {seed}");
+            let is_told = codes(&outcome).contains(&"PURE_TRANSLATION");
+            assert_eq!(is_told, grade == Grade::ProjectiveOnly, "noise {noise}, seed {seed}");
+        }
+    }
+}
