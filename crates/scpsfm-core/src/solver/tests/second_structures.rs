@@ -257,6 +257,18 @@ fn a_calibration_of_few_tracks_does_not_stand_before_the_scene() {
     assert!(kept.precision > 0.95 && wanted.recall > 0.9, "{kept:?} {wanted:?}");
 }
 
+/// Sixteen tracks in six of 26 views, with a fortieth of the scene's evidence, which are all that is left there.
+#[test]
+fn a_body_of_few_tracks_is_told_where_it_explains_all_that_is_left() {
+    let (input, scene) = photographed(800_463, WrongKind::SecondBody);
+    let solution = solved(&input, &SolveSettings::default());
+    let marked = marked(&solution);
+    let found = agreement(&marked, &scene.truth.second_body);
+    println!("{found:?}, {:?}", solution.warnings);
+    assert!(tells(&solution) && found.precision > 0.95 && marked.iter().filter(|is_of| **is_of).count() >= 8);
+    assert_apart(&solution);
+}
+
 /// Pinholes fit a part of what a strong lens shows, and another part moves alike until the lens is known.
 #[test]
 fn tracks_that_a_lens_brings_in_are_no_second_structure() {
