@@ -276,18 +276,13 @@ pub fn calibrate(
             depths::calibrate(problem, &attempt.block.complete, consensus, *focal)
         }
         _ => {
-            let found = calibrate_projective(problem, projective, priors)?;
+            let known = |camera: usize| priors.get(camera).copied().flatten().or(problem.focal_priors[camera]);
+            let found = calibrate_projective(problem, projective, known)?;
             let did_not_turn = found.warnings.iter().any(|warning| warning.code == WarningCode::PureTranslation);
             match problem.undone.as_ref().filter(|_| did_not_turn && !problem.has_own_focals()) {
                 Some(undone) => {
-                    let mut of_lenses = undone.focal_priors(problem.scale_px, OPTIONS.undone_sigma);
-                    for (of_lens, known) in of_lenses.iter_mut().zip(&problem.focal_priors) {
-                        *of_lens = known.or(*of_lens);
-                    }
-                    for (of_lens, known) in of_lenses.iter_mut().zip(priors) {
-                        *of_lens = known.or(*of_lens);
-                    }
-                    calibrate_projective(problem, projective, &of_lenses)?
+                    let of_lenses = undone.focal_priors(problem.scale_px, OPTIONS.undone_sigma);
+                    calibrate_projective(problem, projective, |camera| known(camera).or(of_lenses[camera]))?
                 }
                 None => found,
             }
@@ -429,16 +424,17 @@ fn decided(problem: &Problem, block: Block, recorder: &mut Recorder) -> Result<A
 }
 
 /// Calibrates from a reconstruction, or as much of it as a calibration takes; the worst of its cameras.
+///
+/// * `known`: what is known of the focal length of a camera beforehand
 fn calibrate_projective(
     problem: &Problem,
     projective: &ProjectiveReconstruction,
-    priors: &[Option<FocalPrior>],
+    known: impl Fn(usize) -> Option<FocalPrior>,
 ) -> Result<Outcome, Error> {
     let most = OPTIONS.most_calibrated.min(OPTIONS.calibrated_observations / projective.views.len().max(1));
     let some = projective.most_observed(most);
     let (group_of, cameras) = problem.cameras_of(&projective.views);
-    let prior = |&camera: &usize| priors.get(camera).copied().flatten().or(problem.focal_priors[camera]);
-    let focal_priors: Vec<Option<FocalPrior>> = cameras.iter().map(prior).collect();
+    let focal_priors: Vec<Option<FocalPrior>> = cameras.iter().copied().map(known).collect();
     let to_calibrate = calibration::Uncalibrated {
         cameras: &some.cameras,
         points: &some.points,

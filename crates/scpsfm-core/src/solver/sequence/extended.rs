@@ -67,7 +67,7 @@ pub fn extend(problem: &Problem, seed: Attempt, recorder: &mut Recorder) -> Resu
         calibrations.iter_mut().for_each(|outcome| refuse(outcome, detail.clone()));
     }
     for (outcome, magnification) in calibrations.iter_mut().zip(magnifications(problem, &model)) {
-        if magnification > OPTIONS.most_magnification {
+        if outcome.grade != Grade::ProjectiveOnly && magnification > OPTIONS.most_magnification {
             let detail = format!(
                 "the lens would move observations outwards by a factor of {magnification:.2}, which with depth in the \
                  scene is rather a camera that turned behind a barrel lens; the most that is believed is {}",
