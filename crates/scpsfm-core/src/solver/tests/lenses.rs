@@ -164,6 +164,13 @@ fn no_view_of_two_cameras_that_are_declared_as_one_refutes_the_focal_length() {
     }
 }
 
+fn solved_photographed(options: &PhotographedOptions) -> (Photographed, Solution) {
+    let scene = Photographed::generate(options).expect("valid options");
+    let input = Input::new(scene.input.clone(), &Limits::default(), "scene").expect("valid input");
+    let solution = solved(&input, &SolveSettings::default());
+    (scene, solution)
+}
+
 /// By how much the log focal length of each camera is off, and its sigma; all must be calibrated.
 fn errors_of_cameras(solution: &Solution, scene: &Photographed) -> Vec<(f64, f64)> {
     let error = |(group, calibration): (u32, Option<&Calibration>)| {
@@ -219,9 +226,7 @@ fn a_strong_lens_is_calibrated_from_what_fits_behind_it() {
             wrong_share: 0.2,
             ..fisheye(PhotographedMotion::Drive, seed)
         };
-        let scene = Photographed::generate(&options).expect("valid options");
-        let input = Input::new(scene.input.clone(), &Limits::default(), "scene").expect("valid input");
-        let solution = solved(&input, &SolveSettings::default());
+        let (scene, solution) = solved_photographed(&options);
         println!("seed {seed}: {:?} {:?}", solution.grade, solution.warnings);
         assert_eq!(solution.grade, Some(Grade::Metric), "seed {seed}");
         for (error, sigma) in errors_of_cameras(&solution, &scene) {
@@ -311,9 +316,7 @@ fn a_camera_that_does_not_turn_is_calibrated_behind_a_fisheye() {
     for seed in [820_140, 820_253, 820_776] {
         let options = PhotographedOptions::drawn(seed);
         assert_eq!((options.motion, options.lens), (PhotographedMotion::Translation, LensKind::Fisheye), "seed {seed}");
-        let scene = Photographed::generate(&options).expect("valid options");
-        let input = Input::new(scene.input.clone(), &Limits::default(), "scene").expect("valid input");
-        let solution = solved(&input, &SolveSettings::default());
+        let (scene, solution) = solved_photographed(&options);
         println!("seed {seed}: {:?} {:?}", solution.grade, solution.warnings);
         assert_eq!(solution.grade, Some(Grade::Metric), "seed {seed}");
         for (error, sigma) in errors_of_cameras(&solution, &scene) {
@@ -333,9 +336,7 @@ fn a_translation_behind_a_barrel_lens_is_not_metric() {
         for seed in 0..3 {
             let options =
                 PhotographedOptions { lens, focal_px, radial, ..fisheye(PhotographedMotion::Translation, seed) };
-            let scene = Photographed::generate(&options).expect("valid options");
-            let input = Input::new(scene.input.clone(), &Limits::default(), "scene").expect("valid input");
-            let solution = solved(&input, &SolveSettings::default());
+            let (_, solution) = solved_photographed(&options);
             println!("{lens:?}, seed {seed}: {:?} {:?}", solution.grade, solution.calibrations.first());
             assert_ne!(solution.grade, Some(Grade::Metric), "{lens:?}, seed {seed}: {:?}", solution.calibrations);
         }
@@ -343,8 +344,6 @@ fn a_translation_behind_a_barrel_lens_is_not_metric() {
     // An equidistant fisheye of 1.5 times the focal length bends as this barrel lens does: WEAK, off by half at 6 sigma.
     let options = PhotographedOptions::drawn(820_818);
     assert_eq!((options.motion, options.lens), (PhotographedMotion::Translation, LensKind::Barrel));
-    let scene = Photographed::generate(&options).expect("valid options");
-    let input = Input::new(scene.input.clone(), &Limits::default(), "scene").expect("valid input");
-    let solution = solved(&input, &SolveSettings::default());
+    let (_, solution) = solved_photographed(&options);
     assert_eq!(solution.grade, Some(Grade::ProjectiveOnly), "{:?}", solution.calibrations);
 }
