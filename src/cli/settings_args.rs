@@ -33,7 +33,8 @@ pub struct SettingsArgs {
     #[arg(long)]
     pub epipolar_depths: bool,
 
-    /// Noise of the observations in pixels, one standard deviation, where known: a start, the noise is estimated
+    /// Noise of the observations in pixels, one standard deviation, where known: a start, the noise is estimated; more
+    /// than twice as much is HIGH_NOISE [default: .5 % of the longest image side]
     #[arg(long, value_name = "PX")]
     pub noise_px: Option<f64>,
 

@@ -51,6 +51,9 @@ pub fn warning(code: WarningCode) -> &'static str {
         WarningCode::StaticTracks => {
             "Tracks that stay where they are in the image are no part of the scene: dirt, a watermark, the carrier of the camera."
         }
+        WarningCode::HighNoise => {
+            "The tracks fit with much more noise than was assumed: wrong ones may be among them, unless the points were measured that roughly."
+        }
         WarningCode::DuplicateTracks => {
             "Some tracks stand in the input several times; they count once, and all have the same answer."
         }

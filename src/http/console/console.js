@@ -57,6 +57,7 @@ const WARNINGS = {
   UNVERIFIED_RANKING: "Nothing was verified; weights are a network's ranking",
   DUPLICATE_TRACKS: "Tracks have the same observations",
   STATIC_TRACKS: "Tracks stay in place in the image",
+  HIGH_NOISE: "The inliers fit at a noise far above the one assumed",
   LITTLE_MOTION: "The views hardly differ",
 };
 

@@ -91,7 +91,8 @@ twins! {
         UnverifiedRanking,
         DuplicateTracks,
         StaticTracks,
-        LittleMotion;
+        LittleMotion,
+        HighNoise;
         Unknown
     }
 }
@@ -133,6 +134,7 @@ mod tests {
             WarningCode::UnverifiedRanking,
             WarningCode::DuplicateTracks,
             WarningCode::StaticTracks,
+            WarningCode::HighNoise,
         ] {
             let wire = proto::WarningCode::try_from(code.to_wire()).expect("known");
             assert_eq!(wire.as_str_name(), format!("WARNING_CODE_{}", code.name()));

@@ -63,6 +63,7 @@ class WarningCode(int, metaclass=_enum_type_wrapper.EnumTypeWrapper):
     WARNING_CODE_STATIC_TRACKS: _ClassVar[WarningCode]
     WARNING_CODE_LITTLE_MOTION: _ClassVar[WarningCode]
     WARNING_CODE_FOCAL_PRIOR_CONTRADICTED: _ClassVar[WarningCode]
+    WARNING_CODE_HIGH_NOISE: _ClassVar[WarningCode]
 
 class LeftOutReason(int, metaclass=_enum_type_wrapper.EnumTypeWrapper):
     __slots__ = ()
@@ -115,6 +116,7 @@ WARNING_CODE_DUPLICATE_TRACKS: WarningCode
 WARNING_CODE_STATIC_TRACKS: WarningCode
 WARNING_CODE_LITTLE_MOTION: WarningCode
 WARNING_CODE_FOCAL_PRIOR_CONTRADICTED: WarningCode
+WARNING_CODE_HIGH_NOISE: WarningCode
 LEFT_OUT_REASON_UNSPECIFIED: LeftOutReason
 LEFT_OUT_REASON_NO_OBSERVATIONS: LeftOutReason
 LEFT_OUT_REASON_OUTSIDE_BLOCK: LeftOutReason

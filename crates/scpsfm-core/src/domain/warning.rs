@@ -50,6 +50,8 @@ pub enum WarningCode {
     DuplicateTracks,
     /// Tracks stay where they are in the image while others move, and no scene holds them.
     StaticTracks,
+    /// The inliers fit at a noise far above the one that was assumed: wrong observations may be among them.
+    HighNoise,
     /// A code that this version does not know: a server of a later one gave it. The detail says what it is.
     #[serde(other)]
     Unknown,
@@ -80,6 +82,7 @@ impl WarningCode {
             | WarningCode::UnverifiedRanking
             | WarningCode::DuplicateTracks
             | WarningCode::StaticTracks
+            | WarningCode::HighNoise
             | WarningCode::Unknown => false,
         }
     }
@@ -113,6 +116,7 @@ impl WarningCode {
             WarningCode::UnverifiedRanking => "UNVERIFIED_RANKING",
             WarningCode::DuplicateTracks => "DUPLICATE_TRACKS",
             WarningCode::StaticTracks => "STATIC_TRACKS",
+            WarningCode::HighNoise => "HIGH_NOISE",
             WarningCode::Unknown => "UNKNOWN",
         }
     }

@@ -9,6 +9,7 @@ use super::calibration::Outcome;
 use super::classification::{self, Judged};
 use super::consensus::{LEAST_INLIERS, LEAST_SUPPORT, LEAST_VIEWS};
 use super::error::Error;
+use super::noise_model;
 use super::portfolio::Found;
 use super::problem::{Problem, camera_groups};
 use super::reconstruction::{Reconstruction, own_verdicts};
@@ -163,6 +164,7 @@ impl Reconstruction {
             .collect::<Result<_, _>>()?;
         warnings.extend(second_structures::warning(&second_structures, &judged.tracks.second_structure, inliers));
         warnings.extend(static_tracks::warning(&problem.is_static, &judged.tracks.inlier));
+        warnings.extend(noise_model::warning(self.geometry.noise, problem.initial_noise, problem.scale_px));
         let frames = self.frames(problem);
         let backs: Vec<Option<Matrix4<f64>>> =
             frames.iter().map(|frame| frame.filter(|_| !self.is_metric())?.try_inverse()).collect();

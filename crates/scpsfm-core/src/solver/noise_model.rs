@@ -3,6 +3,7 @@
 use nalgebra::Vector2;
 
 use super::spread::{MOST_SPREAD, spread_of};
+use crate::domain::{Warning, WarningCode};
 use crate::geometry::statistics::median;
 
 options! {
@@ -30,6 +31,9 @@ options! {
         /// Points from which a view counts for the density of wrong observations. The spread of eight is known to a
         /// third.
         least_points: usize = 8,
+        /// Noise of a result, in units of the assumed one, above which HIGH_NOISE is given. What is assumed is meant as
+        /// an upper bound, and twice that is more than an inexact guess.
+        high_noise_ratio: f64 = 2.0,
     }
 }
 
@@ -56,6 +60,28 @@ pub fn outlier_density(of_view: &[Vec<u32>], points: &[Vector2<f64>]) -> f64 {
 pub fn evidence(observations: usize, unknowns: usize, noise: f64, outlier_density: f64) -> f64 {
     let constraints = (2 * observations) as f64 - unknowns as f64;
     -constraints * (outlier_density * noise * (std::f64::consts::TAU * std::f64::consts::E).sqrt()).ln()
+}
+
+/// Whether the noise of a result is far above the assumed one.
+pub fn is_high(noise: f64, assumed: f64) -> bool {
+    noise > OPTIONS.high_noise_ratio * assumed
+}
+
+/// HIGH_NOISE, where a result fits only at a noise far above the assumed one: a result that mixes two structures has such
+/// noise, and so do points that were measured roughly.
+///
+/// * `noise`, `assumed`: one standard deviation of a coordinate, in units of `scale_px` pixels
+pub fn warning(noise: f64, assumed: f64, scale_px: f64) -> Option<Warning> {
+    if !is_high(noise, assumed) {
+        return None;
+    }
+    let ratio = noise / assumed;
+    let [noise_px, assumed_px] = [noise, assumed].map(|noise| noise * scale_px);
+    let detail = format!(
+        "the inliers fit at a noise of {noise_px:.2} px, {ratio:.1} times the {assumed_px:.2} px that were assumed: wrong \
+         observations may be among them, unless the points were measured that roughly"
+    );
+    Some(Warning::new(WarningCode::HighNoise, detail))
 }
 
 /// How the residuals of right observations are distributed.
@@ -162,6 +188,14 @@ mod tests {
         assert!((beside / alone - 1.0).abs() < 1e-12, "{alone} {beside}");
         let nothing = outlier_density(&[Vec::new(), vec![0]], &points);
         assert!(nothing.is_finite() && outlier_density(&[], &[]).is_finite(), "{nothing}");
+    }
+
+    #[test]
+    fn twice_the_assumed_noise_is_high() {
+        let is_told = |ratio: f64| warning(0.004 * ratio, 0.004, 1000.0).is_some();
+        assert!(!is_told(0.1) && !is_told(1.99) && is_told(2.01) && is_told(50.0));
+        let detail = warning(0.01, 0.004, 1000.0).expect("high").detail;
+        assert!(detail.contains("10.00 px, 2.5 times the 4.00 px"), "{detail}");
     }
 
     #[test]

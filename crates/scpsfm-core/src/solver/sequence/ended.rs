@@ -47,6 +47,18 @@ impl Ended {
         }
     }
 
+    /// The noise at which the observations fit, one standard deviation in normalised units; `None` where image points
+    /// alone verify nothing.
+    pub fn noise(&self) -> Option<f64> {
+        match self {
+            Ended::Extended(extended) => Some(extended.model.noise),
+            Ended::Block(attempt) => {
+                let attempt = attempt.as_ref().filter(|attempt| attempt.judges_observations())?;
+                Some(attempt.projective.as_ref()?.noise)
+            }
+        }
+    }
+
     /// How well the observations fit, see [`evidence`](crate::solver::noise_model::evidence).
     pub fn evidence(&self, problem: &Problem) -> f64 {
         match self {

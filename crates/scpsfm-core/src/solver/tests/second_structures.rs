@@ -269,6 +269,17 @@ fn a_body_of_few_tracks_is_told_where_it_explains_all_that_is_left() {
     assert_apart(&solution);
 }
 
+/// From the assumed noise scene and body are found as one structure at a noise of 28 px, half of it wrong.
+#[test]
+fn what_is_mixed_at_a_high_noise_is_told_apart_from_a_lower_one() {
+    let (input, scene) = photographed(870_228, WrongKind::SecondBody);
+    let solution = solved(&input, &SolveSettings { focal_per_view: true, ..SolveSettings::default() });
+    let kept = agreement(&solution.observations.inlier, &scene.truth.observation_right);
+    println!("{kept:?}, {:?} px, {:?}", solution.noise_px, solution.warnings);
+    assert!(kept.precision > 0.95 && solution.noise_px.is_some_and(|noise_px| noise_px < 2.0));
+    assert!(tells(&solution), "{:?}", solution.warnings);
+}
+
 /// Pinholes fit a part of what a strong lens shows, and another part moves alike until the lens is known.
 #[test]
 fn tracks_that_a_lens_brings_in_are_no_second_structure() {

@@ -206,6 +206,21 @@ fn what_is_static_before_a_camera_that_does_not_turn_is_not_the_scene_either() {
     }
 }
 
+/// Of a square of 1000 px 5 px are assumed; `noise_px` replaces them.
+#[test]
+fn noise_far_above_the_assumed_one_gives_a_warning() {
+    for seed in 0..2 {
+        let told = |noise: f64, noise_px: Option<f64>| {
+            let (input, _) = scene(SceneOptions { noise, outliers: 0.3, seed, ..default() });
+            let solution = solved(&input, &SolveSettings { seed, noise_px, ..SolveSettings::default() });
+            assert_eq!(solution.grade, Some(Grade::Metric), "seed {seed}: {:?}", solution.warnings);
+            warns(&solution, WarningCode::HighNoise)
+        };
+        let found = [(0.003, None), (0.02, None), (0.02, Some(15.0)), (0.003, Some(1.0))];
+        assert_eq!(found.map(|(noise, noise_px)| told(noise, noise_px)), [false, true, false, true], "seed {seed}");
+    }
+}
+
 fn default() -> SceneOptions {
     SceneOptions::default()
 }
