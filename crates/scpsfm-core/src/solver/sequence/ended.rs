@@ -3,9 +3,10 @@
 use super::extended::{Extended, extend};
 use super::options::ExtensionOptions;
 use super::starts::extend_projectively;
-use crate::domain::Stage;
+use crate::domain::{Grade, Stage};
 use crate::solver::attempt::{self, Attempt};
 use crate::solver::error::Error;
+use crate::solver::noise_model;
 use crate::solver::problem::Problem;
 use crate::solver::reconstruction::Reconstruction;
 use crate::solver::recorder::Recorder;
@@ -47,16 +48,18 @@ impl Ended {
         }
     }
 
-    /// The noise at which the observations fit, one standard deviation in normalised units; `None` where image points
-    /// alone verify nothing.
-    pub fn noise(&self) -> Option<f64> {
-        match self {
-            Ended::Extended(extended) => Some(extended.model.noise),
+    /// Whether it fits only at a noise far above the assumed one, by image points alone, and has no METRIC calibration,
+    /// which structures that were mixed would hardly agree on.
+    pub fn may_be_mixed(&self, problem: &Problem) -> bool {
+        let (noise, grade) = match self {
+            Ended::Extended(extended) => (Some(extended.model.noise), Some(extended.grade(problem))),
             Ended::Block(attempt) => {
-                let attempt = attempt.as_ref().filter(|attempt| attempt.judges_observations())?;
-                Some(attempt.projective.as_ref()?.noise)
+                let attempt = attempt.as_ref().filter(|attempt| attempt.judges_observations());
+                let noise = attempt.and_then(|attempt| Some(attempt.projective.as_ref()?.noise));
+                (noise, attempt.and_then(|attempt| Some(attempt.calibration.as_ref()?.grade)))
             }
-        }
+        };
+        grade != Some(Grade::Metric) && noise.is_some_and(|noise| noise_model::is_high(noise, problem.initial_noise))
     }
 
     /// How well the observations fit, see [`evidence`](crate::solver::noise_model::evidence).

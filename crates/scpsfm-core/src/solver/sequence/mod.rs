@@ -42,21 +42,20 @@ pub use quick_pass::reconstruct_quickly;
 pub use structure::widest_angle;
 
 use super::error::Error;
-use super::noise_model;
 use super::problem::Problem;
 use super::recorder::Recorder;
 use lens::BehindLenses;
 use quick_pass::QuickPass;
 
-/// Solves an input, and once more from a lower noise where the answer fits only at a noise far above the assumed one:
-/// searched at a high noise, structures that should be told apart may be mixed. The answer that is worth more is kept.
+/// Solves an input, and once more from a lower noise where structures may be mixed, see [`Ended::may_be_mixed`]: there
+/// they are told apart. The answer that is worth more is kept.
 pub fn solve(problem: &mut Problem, recorder: &mut Recorder) -> Result<Ended, Error> {
     let ended = solve_from_noise(problem, recorder)?;
-    let assumed = problem.initial_noise;
-    if !ended.noise().is_some_and(|noise| noise_model::is_high(noise, assumed)) {
+    if !ended.may_be_mixed(problem) {
         return Ok(ended);
     }
     recorder.begin_again();
+    let assumed = problem.initial_noise;
     let (worth, undone) = (ended.worth(problem), problem.undone.take());
     problem.initial_noise = ExtensionOptions::DEFAULT.lower_noise * assumed;
     let again = solve_from_noise(problem, recorder)?;
@@ -68,9 +67,9 @@ pub fn solve(problem: &mut Problem, recorder: &mut Recorder) -> Result<Ended, Er
     Ok(ended)
 }
 
-/// Solves an input from the assumed noise. Where pinholes give no calibration of most views, solves it once more with the lenses undone that
-/// explain seeds better, before anything else is tried of pinholes, and where that calibrates a part, with the lenses
-/// undone that were calibrated; what is undone stays so in the problem where that answer stands.
+/// Solves an input from the assumed noise. Where pinholes give no calibration of most views, solves it once more with the
+/// lenses undone that explain seeds better, before anything else is tried of pinholes, and where that calibrates a part,
+/// with the lenses undone that were calibrated; what is undone stays so in the problem where that answer stands.
 fn solve_from_noise(problem: &mut Problem, recorder: &mut Recorder) -> Result<Ended, Error> {
     let quick = QuickPass::new(problem, recorder)?;
     let mut behind = None;
