@@ -115,6 +115,17 @@ impl IntrinsicsModel {
         self
     }
 
+    /// This model with one extension fewer.
+    pub fn without(mut self, extension: Extension) -> Self {
+        self.extensions[extension as usize] = false;
+        self
+    }
+
+    /// The extensions that no other of this model needs.
+    pub fn removable(self) -> impl Iterator<Item = Extension> {
+        self.extensions().filter(move |one| self.extensions().all(|other| other.needs() != Some(*one)))
+    }
+
     /// This model with everything freed beside the focal length.
     pub const fn with_all_extensions(self) -> Self {
         Self { extensions: [true; Extension::ALL.len()], ..self }
@@ -238,6 +249,9 @@ mod tests {
             assert_eq!(simplest.with_any_extensions().count(), 28);
             assert_eq!(simplest.with_any_extensions().next(), Some(simplest));
         }
+        let later = radial.with(Extension::RadialK2);
+        assert_eq!(later.removable().collect::<Vec<_>>(), [Extension::PrincipalPoint, Extension::RadialK2]);
+        assert_eq!(later.without(Extension::RadialK2), radial);
         let own = IntrinsicsModel::FOCAL_PER_VIEW.with(Extension::RadialK1);
         assert_eq!(own.name(), "a focal length a view and radial distortion");
         assert_eq!(own.parameters(), [Parameter::RadialK1]);

@@ -162,6 +162,28 @@ impl MetricReconstruction {
         !self.focals.is_empty()
     }
 
+    /// The simplest model that all lenses are of: with the extensions that any of them has.
+    pub fn model(&self) -> IntrinsicsModel {
+        let has = |extension: &Extension| {
+            let is_free =
+                |lens: &Intrinsics| extension.parameters().iter().any(|parameter| lens.value(*parameter) != 0.0);
+            self.intrinsics.iter().any(is_free)
+        };
+        let simplest = IntrinsicsModel::focal(self.has_own_focals());
+        Extension::ALL.into_iter().filter(has).fold(simplest, IntrinsicsModel::with)
+    }
+
+    /// The same with lenses of this model, still to be adjusted: what it does not free is as in the simplest lens.
+    pub fn of_model(mut self, model: IntrinsicsModel) -> Self {
+        for lens in &mut self.intrinsics {
+            let before = std::mem::replace(lens, lens.simplest());
+            for parameter in model.extensions().flat_map(Extension::parameters) {
+                lens.shift(*parameter, before.value(*parameter));
+            }
+        }
+        self
+    }
+
     /// Intrinsics of a view.
     ///
     /// # Panics
@@ -227,6 +249,24 @@ mod tests {
     use super::super::testing::{self, NOISE};
     use super::*;
     use crate::domain::StopToken;
+
+    #[test]
+    fn lenses_are_of_the_model_of_their_extensions() {
+        let mut reconstruction = testing::scene(1, 4, 10, 0.0).reconstruction();
+        assert_eq!(reconstruction.model(), IntrinsicsModel::FOCAL);
+        let lens = &mut reconstruction.intrinsics[0];
+        (lens.aspect, lens.radial, lens.principal_point) = (1.03, [-0.2, 0.1, 0.0], Vector2::new(0.01, 0.0));
+        let model = reconstruction.model();
+        let expected = [Extension::PrincipalPoint, Extension::Aspect, Extension::RadialK1, Extension::RadialK2];
+        assert_eq!(model.extensions().collect::<Vec<_>>(), expected);
+        assert!(reconstruction.clone().with_own_focals().model().is_per_view());
+        let simpler = model.without(Extension::Aspect).without(Extension::RadialK2);
+        let found = reconstruction.clone().of_model(simpler);
+        assert_eq!(found.model(), simpler);
+        let [lens, before] = [&found, &reconstruction].map(|of| of.intrinsics[0]);
+        assert_eq!((lens.aspect, lens.radial), (1.0, [-0.2, 0.0, 0.0]));
+        assert_eq!((lens.focal, lens.principal_point), (before.focal, before.principal_point));
+    }
 
     #[test]
     fn converges_from_a_perturbed_start_to_the_noise_floor() {

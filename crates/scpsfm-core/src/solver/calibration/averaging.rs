@@ -54,7 +54,7 @@ impl Choice<'_> {
     /// * `priors`: those of the best model, or without what is known of a focal length
     /// * `inflation`: factor on all of them, for what a linearisation with independent noise does not see
     pub fn sigmas(&self, selection: &Selection, priors: &[IntrinsicsPrior], inflation: f64) -> Sigmas {
-        let Selection { best, tried } = selection;
+        let Selection { best, tried, .. } = selection;
         let views = best.minimum.reconstruction.focals.len();
         let here = best.sigma_log_focal().and_then(|_| best.optimum(best.model, priors));
         let Some(here) = here else {
@@ -118,7 +118,7 @@ impl Choice<'_> {
         model: IntrinsicsModel,
         priors: &[IntrinsicsPrior],
     ) -> Vec<Weighed<'c>> {
-        let Selection { best, tried } = selection;
+        let Selection { best, tried, .. } = selection;
         let differing = |candidate: &Candidate| {
             let extensions = Extension::ALL.into_iter();
             extensions.filter(|one| candidate.model.contains(*one) != model.contains(*one)).count()

@@ -4,28 +4,26 @@ use super::fit::Fit;
 use super::misfit::Comparison;
 use super::models::{Candidate, Choice, Selection};
 use super::options::CalibrationOptions;
-use super::search::Minimum;
+use super::search::{self, Minimum};
 use super::verdict::Verdict;
 use super::view_focals::{self, Differing};
 use super::{Outcome, Stretch, Uncalibrated};
 use crate::domain::{Grade, Warning, WarningCode};
-use crate::geometry::bundle::metric::{Extension, IntrinsicsModel, IntrinsicsPrior, Parameter};
+use crate::geometry::bundle::metric::{Extension, IntrinsicsModel, IntrinsicsPrior, MetricReconstruction, Parameter};
 use crate::solver::error::Error;
 
-/// Chooses among the minima and models, and says what the choice is worth for each camera group.
+/// What a selection is worth for each camera group.
 ///
 /// * `fit`: of the projective cameras, to the views of `stretch`
 /// * `stretch`: the views on which both are compared; `None`: all
-/// * `minima`: not empty, cheapest first, with the focal length free, or that of each view
 pub(super) fn grade(
     choice: &Choice,
     fit: &Fit,
     stretch: Option<Stretch>,
-    minima: Vec<Minimum>,
-    mut warnings: Vec<Warning>,
+    selection: Selection,
+    warnings: Vec<Warning>,
 ) -> Result<Vec<Outcome>, Error> {
     let CalibrationOptions { fit: fit_options, lenses, grades, .. } = choice.problem.options;
-    let (selection, others) = chosen(choice, fit, minima, &mut warnings)?;
     let best = &selection.best;
     Error::check(choice.stop)?;
     let comparison = match &stretch {
@@ -44,7 +42,7 @@ pub(super) fn grade(
     let has_own_focals = best.minimum.reconstruction.has_own_focals();
     let mut focals = view_focals::of(best, &sigmas, lenses);
     let determined: Vec<bool> = focals.iter().map(|view| view_focals::is_determined(view, grades)).collect();
-    let rival = rival(choice.problem, best, &others, |view| determined[view]);
+    let rival = rival(choice.problem, best, &selection.others, |view| determined[view]);
     // Of cameras that were taken for one, the tracks that fit are those that projective cameras fit as badly: their
     // ratio is no misfit, and what they violate the calibration by is. Where it is that alone, views of one camera
     // differ by some tenths of a per cent too, behind a lens that the model does not quite have: only what the grade
@@ -125,43 +123,108 @@ pub(super) fn grade(
     Ok(outcomes)
 }
 
-/// The best minimum under the richest model that the data carry, and the others under the same model.
-fn chosen(
+/// The best of some minima under the model that the data carry, and the others under the same.
+///
+/// * `minima`: not empty, cheapest first, of the simplest model
+pub(super) fn select_among(
+    choice: &Choice,
+    fit: &Fit,
+    minima: Vec<Minimum>,
+    warnings: &mut Vec<Warning>,
+) -> Result<Selection, Error> {
+    let model = IntrinsicsModel::focal(minima[0].reconstruction.has_own_focals());
+    select(choice, fit, minima, model, choice.priors(fit.noise), warnings, &mut || ())
+}
+
+/// The same of the minimum near a metric reconstruction, under the model of its lenses, and of those that other focal
+/// lengths lead to; `None` where it does not converge. Others are looked for where the best may be a calibration.
+///
+/// * `stretch`: as of [`grade`]
+/// * `heartbeat`: called after each minimum
+pub(super) fn select_near(
+    choice: &Choice,
+    fit: &Fit,
+    metric: &MetricReconstruction,
+    stretch: Option<&Stretch>,
+    warnings: &mut Vec<Warning>,
+    heartbeat: &mut dyn FnMut(),
+) -> Result<Option<Selection>, Error> {
+    let model = metric.model();
+    let Candidate { minimum, priors, .. } = &choice.adjusted(metric.clone(), model, fit.noise);
+    Error::check(choice.stop)?;
+    heartbeat();
+    if !minimum.cost.is_finite() {
+        return Ok(None);
+    }
+    let first = Candidate::new(minimum.clone(), model, priors.clone(), choice.problem);
+    let mut minima = vec![minimum.clone()];
+    let is_compared = choice.may_be_observable(&first);
+    if is_compared {
+        let search = choice.search(priors);
+        minima.extend(search.minima_from_other_focals(metric, model, minimum.cost, stretch, heartbeat)?);
+        minima = search::distinct(minima, choice.problem);
+    }
+    let found = select(choice, fit, minima, model, priors.clone(), warnings, heartbeat)?;
+    if is_compared || !choice.may_be_observable(&found.best) {
+        return Ok(Some(found));
+    }
+    let Candidate { minimum: Minimum { reconstruction, cost, .. }, model, priors, .. } = &found.best;
+    let search = choice.search(priors);
+    let others = search.minima_from_other_focals(reconstruction, *model, *cost, stretch, heartbeat)?;
+    with_others(choice, found, others, heartbeat).map(Some)
+}
+
+/// * `minima`: not empty, cheapest first, of this model with these priors
+fn select(
     choice: &Choice,
     fit: &Fit,
     mut minima: Vec<Minimum>,
+    model: IntrinsicsModel,
+    priors: Vec<IntrinsicsPrior>,
     warnings: &mut Vec<Warning>,
-) -> Result<(Selection, Vec<Minimum>), Error> {
-    let problem = choice.problem;
-    let first = minima.remove(best_in_front(&minima, problem, fit));
-    let simplest = IntrinsicsModel::focal(first.reconstruction.has_own_focals());
-    let mut of_model = Vec::new();
-    let simple = Candidate::new(first, simplest, choice.priors(fit.noise), problem);
-    let found = choice.richest(simple, &mut of_model)?;
-    // Of the simplest model no projection is replaced, and the minima are its own.
-    let is_simplest = found.best.model == simplest;
-    let (mut found, of_model) = choice.with_other_projection(found, &mut minima, of_model)?;
-    warnings.extend(of_model);
-    if is_simplest {
-        return Ok((found, minima));
+    heartbeat: &mut dyn FnMut(),
+) -> Result<Selection, Error> {
+    let first = minima.remove(best_in_front(&minima, choice.problem, fit));
+    let first = Candidate::new(first, model, priors, choice.problem);
+    let projections = first.projections();
+    let selection = choice.select_of_any_projection(first, &mut minima, warnings)?;
+    if selection.best.model == model && selection.best.projections() == projections {
+        return Ok(Selection { others: minima, ..selection });
     }
-    let least_in_front = problem.options.grades.least_in_front;
-    let mut others = Vec::with_capacity(minima.len());
+    with_others(choice, selection, minima, heartbeat)
+}
+
+/// A selection with what other minima converge to under its model; a better one is taken in its place.
+///
+/// * `heartbeat`: called after each
+fn with_others(
+    choice: &Choice,
+    mut selection: Selection,
+    minima: Vec<Minimum>,
+    heartbeat: &mut dyn FnMut(),
+) -> Result<Selection, Error> {
+    let problem = choice.problem;
+    let CalibrationOptions { search, grades, .. } = problem.options;
     for start in minima {
         Error::check(choice.stop)?;
-        let best = &found.best;
-        let search = choice.search(&best.priors);
-        let Some(mut minimum) = search.converged_near(start.reconstruction, best.model, best.minimum.cost) else {
+        let best = &selection.best;
+        let start = start.reconstruction.of_model(best.model);
+        let found = choice.search(&best.priors).converged_near(start, best.model, best.minimum.cost);
+        heartbeat();
+        let Some(mut minimum) = found else { continue };
+        let lowered = best.minimum.cost - minimum.cost;
+        let is_told_apart = lowered > grades.indistinguishable * best.fit.noise.powi(2);
+        if !is_told_apart && minimum.repeats(&best.minimum, &best.minimum.determined(problem), search) {
             continue;
-        };
-        // A model that is wrong may rank the minima wrongly.
-        if minimum.cost < best.minimum.cost && minimum.cheirality >= least_in_front.min(best.minimum.cheirality) {
-            let better = Candidate::new(minimum.clone(), best.model, best.priors.clone(), problem);
-            minimum = found.replace(better).minimum;
         }
-        others.push(minimum);
+        // A model that is wrong may rank the minima wrongly.
+        if lowered > 0.0 && minimum.cheirality >= grades.least_in_front.min(best.minimum.cheirality) {
+            let better = Candidate::new(minimum.clone(), best.model, best.priors.clone(), problem);
+            minimum = selection.replace(better).minimum;
+        }
+        selection.others.push(minimum);
     }
-    Ok((found, others))
+    Ok(selection)
 }
 
 /// The cheapest minimum whose points are in front of the cameras, if the data do not tell it from the cheapest.

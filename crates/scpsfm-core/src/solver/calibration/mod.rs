@@ -222,7 +222,8 @@ pub fn calibrate(problem: &Uncalibrated, scale_px: f64, stop: &StopToken) -> Res
         warnings.push(no_start());
         return Ok(problem.refused(&warnings));
     }
-    grading::grade(&choice, &fit, None, minima, warnings)
+    let selection = grading::select_among(&choice, &fit, minima, &mut warnings)?;
+    grading::grade(&choice, &fit, None, selection, warnings)
 }
 
 /// Some of the views of a reconstruction, which projective cameras are fitted to where they are too many for that.
@@ -233,7 +234,7 @@ pub struct Stretch<'a> {
 }
 
 /// Calibrates a reconstruction that is metric already, as a sequence is that grew from a calibrated block: its focal
-/// length is known to be near a minimum, and others are looked for near it.
+/// length is known to be near a minimum, and others are looked for near it where it may be determined.
 ///
 /// * `problem`: the projective cameras and points of `metric`
 /// * `stretch`: the views on which it is compared with projective cameras, of the same camera groups; `None`: all
@@ -279,20 +280,12 @@ pub fn from_metric(
         }
     };
     let choice = models::Choice { problem, scale_px, stop };
-    let priors = choice.priors(fit.noise);
-    let search = choice.search(&priors);
-    let mut factors: Vec<f64> = std::iter::once(1.0).chain(problem.options.search.other_focals).collect();
-    if let Some(Stretch { problem, metric }) = &stretch {
-        // Many views are adjusted from where few of them end, instead of from everywhere.
-        let found = Search { problem, ..search }.minima_near(metric, &factors, heartbeat)?;
-        factors = found.iter().map(|minimum| (minimum.log_focal() - metric.log_focal()).exp()).collect();
-    }
-    let minima = search.minima_near(metric, &factors, heartbeat)?;
-    if minima.is_empty() {
+    let selection = grading::select_near(&choice, &fit, metric, stretch.as_ref(), &mut warnings, heartbeat)?;
+    let Some(selection) = selection else {
         warnings.push(no_start());
         return Ok(problem.refused(&warnings));
-    }
-    let mut outcomes = grading::grade(&choice, &fit, stretch, minima, warnings)?;
+    };
+    let mut outcomes = grading::grade(&choice, &fit, stretch, selection, warnings)?;
     for outcome in outcomes.iter_mut().filter(|outcome| outcome.grade == Grade::ProjectiveOnly) {
         outcome.warnings.splice(0..0, of_refusal.iter().cloned());
     }

@@ -4,7 +4,7 @@ use super::Uncalibrated;
 use super::fit::Fit;
 use super::options::{CalibrationOptions, GradeOptions, ModelOptions};
 use super::search::{Minimum, Search};
-use crate::domain::{FocalPrior, StopToken, Warning, WarningCode};
+use crate::domain::{FocalPrior, LensProjection, StopToken, Warning, WarningCode};
 use crate::geometry::bundle::metric::{
     Extension, Information, Intrinsics, IntrinsicsModel, IntrinsicsPrior, MetricReconstruction, Optimum, Parameter,
 };
@@ -72,8 +72,12 @@ impl Candidate {
 
     /// Whether each group's lens is of the same projection as the other's.
     pub fn has_projections_of(&self, other: &Self) -> bool {
-        let [own, others] = [self, other].map(|candidate| candidate.minimum.reconstruction.intrinsics.iter());
-        own.zip(others).all(|(own, other)| own.projection == other.projection)
+        self.projections() == other.projections()
+    }
+
+    /// Of each group's lens.
+    pub fn projections(&self) -> Vec<LensProjection> {
+        self.minimum.reconstruction.intrinsics.iter().map(|lens| lens.projection).collect()
     }
 
     /// Standard deviation of the log focal length of one group if the model is right.
@@ -88,6 +92,8 @@ pub(super) struct Selection {
     /// Simpler models, and richer ones that were not taken, of the same minimum, and all of them behind lenses of the
     /// other projection.
     pub tried: Vec<Candidate>,
+    /// Other minima under the same model.
+    pub others: Vec<Minimum>,
 }
 
 impl Selection {
@@ -127,10 +133,10 @@ impl Choice<'_> {
     /// The minimum of a model from here, with the prior weighed by the noise that this leaves.
     ///
     /// * `noise`: to begin with
-    fn adjusted(&self, from: &Minimum, model: IntrinsicsModel, mut noise: f64) -> Candidate {
-        let adjusted = |from: &Minimum, noise: f64| {
+    pub fn adjusted(&self, from: MetricReconstruction, model: IntrinsicsModel, mut noise: f64) -> Candidate {
+        let adjusted = |from: MetricReconstruction, noise: f64| {
             let priors = self.priors(noise);
-            let minimum = self.search(&priors).converged(from.reconstruction.clone(), model);
+            let minimum = self.search(&priors).converged(from, model);
             Candidate::new(minimum, model, priors, self.problem)
         };
         let mut found = adjusted(from, noise);
@@ -140,7 +146,7 @@ impl Choice<'_> {
                 break;
             }
             noise = found.fit.noise;
-            found = adjusted(&found.minimum, noise);
+            found = adjusted(found.minimum.reconstruction, noise);
         }
         found
     }
@@ -155,15 +161,50 @@ impl Choice<'_> {
         Candidate::new(minimum, chosen.model, chosen.priors.clone(), self.problem)
     }
 
+    /// The model that the data carry, from one that is near: without the extensions that they do not ask for, and with
+    /// those that they do.
+    fn select(&self, from: Candidate, warnings: &mut Vec<Warning>) -> Result<Selection, Error> {
+        let found = self.without_needless(from, warnings)?;
+        self.with_needed(found, warnings)
+    }
+
+    /// Takes away extension after extension, the least significant first, as long as there is one that the data do not
+    /// ask for, or that leaves the focal length undetermined.
+    fn without_needless(&self, rich: Candidate, warnings: &mut Vec<Warning>) -> Result<Selection, Error> {
+        let mut found = Selection { best: rich, tried: Vec::new(), others: Vec::new() };
+        loop {
+            let mut accepted = None;
+            for extension in self.doubtful(&found.best) {
+                Error::check(self.stop)?;
+                let best = &found.best;
+                let model = best.model.without(extension);
+                let without = best.minimum.reconstruction.clone().of_model(model);
+                let simpler = self.adjusted(without, model, best.fit.noise);
+                if simpler.information.is_some() && !self.is_taken(&simpler, best, extension, warnings) {
+                    accepted = Some(simpler);
+                    break;
+                }
+                found.tried.push(simpler);
+            }
+            match accepted {
+                Some(simpler) => found.tried.push(std::mem::replace(&mut found.best, simpler)),
+                None => return Ok(found),
+            }
+        }
+    }
+
     /// Frees extension after extension, the most significant first, as long as the data ask for one and still determine
     /// the focal length.
-    pub fn richest(&self, simple: Candidate, warnings: &mut Vec<Warning>) -> Result<Selection, Error> {
-        let mut found = Selection { best: simple, tried: Vec::new() };
+    fn with_needed(&self, mut found: Selection, warnings: &mut Vec<Warning>) -> Result<Selection, Error> {
         loop {
             let mut taken = None;
             for (extension, _) in self.promising(&found.best) {
                 Error::check(self.stop)?;
-                let richer = self.adjusted(&found.best.minimum, found.best.model.with(extension), found.best.fit.noise);
+                let model = found.best.model.with(extension);
+                let richer = match found.tried.iter().position(|tried| tried.model == model) {
+                    Some(tried) => found.tried.remove(tried),
+                    None => self.adjusted(found.best.minimum.reconstruction.clone(), model, found.best.fit.noise),
+                };
                 if self.is_taken(&found.best, &richer, extension, warnings) {
                     taken = Some(richer);
                     break;
@@ -177,8 +218,8 @@ impl Choice<'_> {
         }
     }
 
-    /// The selection with lenses of the other projection tried, where they may stand in the place of those that were
-    /// found, and its warnings, which are of the best.
+    /// The model that the data carry, as of [`Self::select`], with lenses of the other projection tried where they may
+    /// stand in the place of those that were found.
     ///
     /// Fisheyes in the place of wide barrels become the best where the chi-square falls by a significant gain for the
     /// other projection and for each parameter more. It may rise by as much for each parameter fewer: the two series of
@@ -186,12 +227,15 @@ impl Choice<'_> {
     /// are those that fit behind the fisheye.
     ///
     /// * `minima`: others, put behind fisheyes where those become the best
-    pub fn with_other_projection(
+    /// * `warnings`: those of the best are added
+    pub fn select_of_any_projection(
         &self,
-        mut found: Selection,
+        from: Candidate,
         minima: &mut [Minimum],
-        warnings: Vec<Warning>,
-    ) -> Result<(Selection, Vec<Warning>), Error> {
+        warnings: &mut Vec<Warning>,
+    ) -> Result<Selection, Error> {
+        let mut of_model = Vec::new();
+        let mut found = self.select(from, &mut of_model)?;
         let ModelOptions { fisheye_from, perspective_up_to, significant_gain_of_one, .. } = self.problem.options.models;
         let best = &found.best;
         let may_be_fisheye =
@@ -203,18 +247,21 @@ impl Choice<'_> {
             let simplest = IntrinsicsModel::focal(best.model.is_per_view());
             let from = best.minimum.with_lenses(fisheye);
             let mut of_fisheyes = Vec::new();
-            let other = self.richest(self.adjusted(&from, simplest, best.fit.noise), &mut of_fisheyes)?;
+            let from = self.adjusted(from.reconstruction, simplest, best.fit.noise);
+            let other = self.select(from, &mut of_fisheyes)?;
             let parameters = |candidate: &Candidate| candidate.model.parameters().len() as f64;
             let added = 1.0 + (parameters(&other.best) - parameters(best)) * self.problem.groups() as f64;
             let gain = (best.fit.cost - other.best.fit.cost) / best.fit.noise.min(other.best.fit.noise).powi(2);
             if gain <= added * significant_gain_of_one {
                 found.tried.extend(other.tried.into_iter().chain([other.best]));
-                return Ok((found, warnings));
+                warnings.extend(of_model);
+                return Ok(found);
             }
             minima.iter_mut().for_each(|minimum| *minimum = minimum.with_lenses(fisheye));
-            let Selection { best, mut tried } = other;
-            tried.extend(found.tried.into_iter().chain([found.best]));
-            return Ok((Selection { best, tried }, of_fisheyes));
+            let mut behind = other;
+            behind.tried.extend(found.tried.into_iter().chain([found.best]));
+            warnings.extend(of_fisheyes);
+            return Ok(behind);
         }
         let may_be_perspective = |lens: &Intrinsics, radius: f64| lens.is_fisheye() && radius < perspective_up_to;
         if let Some(radii) = self.radii(&best.minimum.reconstruction, may_be_perspective) {
@@ -223,10 +270,24 @@ impl Choice<'_> {
                 .with_lenses(|group, lens| radii[group].map_or(*lens, |radius| lens.nearest_perspective(radius)));
             let radial = [Extension::RadialK1, Extension::RadialK2, Extension::RadialK3];
             let model = radial.into_iter().fold(best.model, IntrinsicsModel::with);
-            let other = self.adjusted(&from, model, best.fit.noise);
+            let other = self.adjusted(from.reconstruction, model, best.fit.noise);
             found.tried.push(other);
         }
-        Ok((found, warnings))
+        warnings.extend(of_model);
+        Ok(found)
+    }
+
+    /// Whether the focal length of a group, or of a view that has its own, may be determined well enough for a
+    /// calibration. The limit is above that of WEAK by `sigma_inflation`: averaging over models may lower sigma.
+    pub fn may_be_observable(&self, best: &Candidate) -> bool {
+        let CalibrationOptions { models, grades, .. } = self.problem.options;
+        let is_small = |sigma: f64| sigma <= models.sigma_inflation * grades.weak_up_to;
+        if (0..self.problem.groups()).any(|group| best.sigma_of_focal(group).is_some_and(is_small)) {
+            return true;
+        }
+        let optimum = best.optimum(best.model, &best.priors);
+        let of_views = optimum.map(|optimum| best.own_focals(&optimum)).unwrap_or_default();
+        of_views.iter().any(|(variance, _)| variance.is_some_and(|variance| is_small(variance.sqrt() * best.fit.noise)))
     }
 
     /// The largest radius at unit depth at which each group observes whose lens is to be replaced; `None` where none is.
@@ -246,6 +307,29 @@ impl Choice<'_> {
         let found: Vec<_> =
             of_lenses.map(|(lens, radius)| Some(radius).filter(|_| is_replaced(lens, radius))).collect();
         found.iter().any(Option::is_some).then_some(found)
+    }
+
+    /// Extensions to try to do without, those that gain least first: the linearisation predicts less than a multiple
+    /// (one over `worth_a_trial`) of the significant gain, or a focal length that is too uncertain.
+    fn doubtful(&self, best: &Candidate) -> Vec<Extension> {
+        let CalibrationOptions { models, grades: GradeOptions { metric_below, .. }, .. } = self.problem.options;
+        let Some(here) = best.optimum(best.model, &best.priors) else { return Vec::new() };
+        let doubt = |extension: Extension| {
+            let simpler = best.model.without(extension);
+            let there = best.optimum(simpler, &best.priors)?;
+            let gain = (there.delta_cost - here.delta_cost) / best.fit.noise.powi(2);
+            let inflates = |group: usize| {
+                let rich = best.sigma_of_focal(group).unwrap_or(f64::INFINITY);
+                let simple = best.sigma(group, Parameter::LogFocal, simpler, &best.priors).unwrap_or(f64::INFINITY);
+                rich == f64::INFINITY || rich > metric_below.max(models.sigma_inflation * simple)
+            };
+            let is_doubtful = gain * models.worth_a_trial < self.significant_gain(extension)
+                || (0..self.problem.groups()).any(inflates);
+            is_doubtful.then_some((extension, gain))
+        };
+        let mut found: Vec<(Extension, f64)> = best.model.removable().filter_map(doubt).collect();
+        found.sort_by(|a, b| a.1.total_cmp(&b.1));
+        found.into_iter().map(|(extension, _)| extension).collect()
     }
 
     /// Extensions that the linearisation predicts to be significant, with the gain beyond what is, largest first.

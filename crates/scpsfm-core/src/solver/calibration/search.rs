@@ -1,8 +1,8 @@
 //! The search for the metric reconstruction: many starts, few that converge.
 
-use super::Uncalibrated;
 use super::fit::Fit;
 use super::options::{CalibrationOptions, SearchOptions};
+use super::{Stretch, Uncalibrated};
 use crate::domain::StopToken;
 use crate::geometry::bundle::critical::Translating;
 use crate::geometry::bundle::metric::{
@@ -44,8 +44,16 @@ impl Minimum {
         root_mean_square(&differences).unwrap_or(0.0)
     }
 
+    /// Whether it is the same minimum as one that is cheaper, or hardly costs more.
+    ///
+    /// * `counts`: one a view
+    pub fn repeats(&self, other: &Self, counts: &[bool], options: &SearchOptions) -> bool {
+        self.apart(other, |view| counts[view]) < options.same_minimum
+            && self.cost < (1.0 + options.same_cost) * other.cost
+    }
+
     /// Of which views the observations determine the focal length; all where they do of none.
-    fn determined(&self, problem: &Uncalibrated) -> Vec<bool> {
+    pub fn determined(&self, problem: &Uncalibrated) -> Vec<bool> {
         let views = self.reconstruction.focals.len();
         if views == 0 {
             return Vec::new();
@@ -115,7 +123,18 @@ impl Search<'_> {
         model: IntrinsicsModel,
         heartbeat: &mut dyn FnMut(),
     ) -> Result<Vec<Minimum>, Error> {
-        let (mut found, mut cheapest) = (Vec::new(), f64::INFINITY);
+        self.converged_below(f64::INFINITY, starts, model, heartbeat)
+    }
+
+    /// The same, without those whose cost will not come near this one either.
+    fn converged_below(
+        &self,
+        mut cheapest: f64,
+        starts: impl IntoIterator<Item = MetricReconstruction>,
+        model: IntrinsicsModel,
+        heartbeat: &mut dyn FnMut(),
+    ) -> Result<Vec<Minimum>, Error> {
+        let mut found = Vec::new();
         for start in starts {
             Error::check(self.stop)?;
             if let Some(minimum) = self.converged_near(start, model, cheapest) {
@@ -169,30 +188,41 @@ impl Search<'_> {
         (Minimum { reconstruction, cost: report.cost, cheirality }, report)
     }
 
-    /// Minima from a reconstruction that is metric already, cheapest first: those that other focal lengths lead to,
-    /// once its poses and points have followed, for freed at once these would only go back to where they were.
+    /// Minima that are reached from other focal lengths than that of a metric reconstruction, cheapest first. Those far
+    /// above a cost are left out.
     ///
-    /// * `factors`: on its focal length, to begin from; 1 for its own
+    /// * `cost`: of the minimum near `metric`
+    /// * `stretch`: some of the views, where they are many: all are adjusted from the focal lengths found there
     /// * `heartbeat`: called after each
-    pub fn minima_near(
+    pub fn minima_from_other_focals(
         &self,
         metric: &MetricReconstruction,
-        factors: &[f64],
+        model: IntrinsicsModel,
+        cost: f64,
+        stretch: Option<&Stretch>,
         heartbeat: &mut dyn FnMut(),
     ) -> Result<Vec<Minimum>, Error> {
-        let model = IntrinsicsModel::focal(metric.has_own_focals());
-        let max_iterations = self.problem.options.search.following_iterations;
-        let start = |&factor: &f64| {
-            let mut reconstruction = metric.clone();
-            reconstruction.intrinsics.iter_mut().for_each(|lens| *lens = lens.simplest());
-            reconstruction.scale_focals(factor);
-            if factor != 1.0 {
-                let following = Options { max_iterations, ..Options::default() };
-                reconstruction = self.adjusted(&following, reconstruction, IntrinsicsModel::FIXED).reconstruction;
-            }
-            reconstruction
+        let options = &self.problem.options.search;
+        let following = Options { max_iterations: options.following_iterations, ..Options::default() };
+        // Poses and points follow: freed at once, they would only go back to where they were.
+        let start = |search: &Search, metric: &MetricReconstruction, factor: f64| {
+            let mut start = metric.clone();
+            start.scale_focals(factor);
+            search.adjusted(&following, start, IntrinsicsModel::FIXED).reconstruction
         };
-        self.converged_all(factors.iter().map(start), model, heartbeat)
+        let mut factors = options.other_focals.to_vec();
+        if let Some(stretch) = stretch {
+            let search = Search { problem: &stretch.problem, ..*self };
+            let here = MetricReconstruction { intrinsics: metric.intrinsics.clone(), ..stretch.metric.clone() };
+            let near = search.converged(here.clone(), model);
+            heartbeat();
+            let starts = factors.iter().map(|&factor| start(&search, &here, factor));
+            let found = search.converged_below(near.cost, starts, model, heartbeat)?;
+            factors = found.iter().map(|other| (other.log_focal() - near.log_focal()).exp()).collect();
+            factors.retain(|factor| factor.ln().abs() > options.same_minimum);
+        }
+        let starts = factors.iter().map(|&factor| start(self, metric, factor));
+        self.converged_below(cost, starts, model, heartbeat)
     }
 
     /// Metric reconstructions with the focal length free, or one of each view, that different starts converge to,
@@ -297,11 +327,7 @@ pub(super) fn distinct(mut found: Vec<Minimum>, problem: &Uncalibrated) -> Vec<M
     let counts = found.first().map(|cheapest| cheapest.determined(problem)).unwrap_or_default();
     let mut kept: Vec<Minimum> = Vec::with_capacity(found.len());
     for candidate in found {
-        let repeats = kept.iter().any(|minimum| {
-            candidate.apart(minimum, |view| counts[view]) < options.same_minimum
-                && candidate.cost < (1.0 + options.same_cost) * minimum.cost
-        });
-        if !repeats {
+        if !kept.iter().any(|minimum| candidate.repeats(minimum, &counts, options)) {
             kept.push(candidate);
         }
     }

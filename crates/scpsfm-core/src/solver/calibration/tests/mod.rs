@@ -101,10 +101,15 @@ fn calibrated_knowing(scene: &TestScene, seed: u64, noise: f64, focal_prior: Opt
 
 /// The calibration of a sequence that grew to where the truth is: what a search costs is left out.
 fn calibrated_from_truth(scene: &TestScene, noise: f64) -> Outcome {
+    calibrated_from(scene, &scene.reconstruction(), noise)
+}
+
+/// The same of one that grew to this.
+fn calibrated_from(scene: &TestScene, metric: &MetricReconstruction, noise: f64) -> Outcome {
     let points: Vec<Vector4<f64>> = scene.points.iter().map(|point| point.push(1.0)).collect();
     let cameras = scene.cameras();
     let problem = of_one_lens(&cameras, &points, &scene.observations, noise);
-    only(from_metric(&problem, &scene.reconstruction(), None, SIDE_PX, &StopToken::default(), &mut || ()))
+    only(from_metric(&problem, metric, None, SIDE_PX, &StopToken::default(), &mut || ()))
 }
 
 /// The outcome of the only camera group.

@@ -133,6 +133,56 @@ fn tangential_distortion_and_a_third_radial_term_are_taken_only_where_the_lens_h
     }
 }
 
+/// The lens estimated so far: what the observations ask for is kept or found, and nothing else is left of it.
+#[test]
+fn the_lens_that_a_reconstruction_comes_with_does_not_matter() {
+    for seed in 0..10 {
+        for radial in [0.0, -0.2] {
+            let scene = through_a_lens(seed, radial, Vector2::zeros(), 0.001);
+            let outcomes =
+                [(0.0, 0.0, 1.0), (-0.2, 0.0, 1.0), (-0.1, 0.02, 1.03)].map(|(radial, off_centre, aspect)| {
+                    let mut metric = scene.reconstruction();
+                    let lens = &mut metric.intrinsics[0];
+                    (lens.radial[0], lens.aspect) = (radial, aspect);
+                    lens.principal_point = Vector2::new(off_centre, -off_centre);
+                    calibrated_from(&scene, &metric, 0.001)
+                });
+            let sigma = outcomes[0].sigma_log_focal.expect("determined");
+            for outcome in &outcomes {
+                println!("k1 {radial}, seed {seed}: {:?} {}", outcome.sigma_log_focal, outcome.model.name());
+                assert_eq!(outcome.model.contains(Extension::RadialK1), radial != 0.0, "k1 {radial}, seed {seed}");
+                assert_eq!(outcome.model, outcomes[0].model, "k1 {radial}, seed {seed}");
+                let metric = outcome.metric.as_ref().expect("a metric reconstruction");
+                assert_eq!(metric.model(), outcome.model, "k1 {radial}, seed {seed}");
+                let [own, other] = [outcome, &outcomes[0]].map(|of| of.intrinsics().expect("metric").focal);
+                assert!((own / other).ln().abs() < 0.05 * sigma, "k1 {radial}, seed {seed}: {own} and {other}");
+            }
+        }
+    }
+}
+
+/// Where no focal length is determined, no other is looked for.
+#[test]
+fn other_focal_lengths_are_compared_only_with_one_that_may_be_determined() {
+    let adjustments = |motion: Motion| {
+        let scene = testing::scene_of(1, 10, 40, NOISE, motion, false);
+        let (cameras, points) = (scene.cameras(), scene.points.iter().map(|point| point.push(1.0)).collect::<Vec<_>>());
+        let problem = of_one_lens(&cameras, &points, &scene.observations, NOISE);
+        let (prior, stop) = (problem.options.lenses.prior(NOISE, None, SIDE_PX), StopToken::default());
+        let choice = super::super::models::Choice { problem: &problem, scale_px: SIDE_PX, stop: &stop };
+        let first = choice.search(&[prior]).converged(scene.reconstruction(), IntrinsicsModel::FOCAL);
+        let fit = Fit::metric(first.cost, &first.reconstruction, IntrinsicsModel::FOCAL, &problem);
+        let mut minima = 0;
+        let mut count = || minima += 1;
+        grading::select_near(&choice, &fit, &scene.reconstruction(), None, &mut Vec::new(), &mut count)
+            .expect("nothing stops it");
+        minima
+    };
+    let others = CalibrationOptions::DEFAULT.search.other_focals.len();
+    assert_eq!(adjustments(Motion::Translation), 1);
+    assert!(adjustments(Motion::General) > others);
+}
+
 #[test]
 fn a_lens_without_distortion_is_left_without() {
     for seed in 0..10 {

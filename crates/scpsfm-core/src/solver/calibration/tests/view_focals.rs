@@ -225,7 +225,9 @@ fn another_minimum_that_explains_as_much_is_told() {
             let mut rival = best.clone();
             rival.reconstruction.focals.iter_mut().take(views).for_each(|focal| *focal *= factor);
             rival = search::Minimum { cost: cost * best.cost, cheirality, ..rival };
-            let outcome = only(grading::grade(choice, fit, None, vec![best.clone(), rival], Vec::new()));
+            let minima = vec![best.clone(), rival];
+            let selection = grading::select_among(choice, fit, minima, &mut Vec::new()).expect("not stopped");
+            let outcome = only(grading::grade(choice, fit, None, selection, Vec::new()));
             (outcome.grade, codes(&outcome).contains(&"SECOND_MINIMUM"))
         };
         let graded = |factor: f64, cost: f64, cheirality: f64| graded_in(10, factor, cost, cheirality);
