@@ -203,6 +203,16 @@ impl MetricReconstruction {
         self.focals.iter_mut().for_each(|focal| *focal *= factor);
     }
 
+    /// The same with other focal lengths, still to be adjusted; what lenses distort in the image stays, to first order.
+    pub fn with_scaled_focals(mut self, factor: f64) -> Self {
+        self.scale_focals(factor);
+        for lens in &mut self.intrinsics {
+            lens.tangential = lens.tangential.map(|term| term * factor);
+            lens.radial = std::array::from_fn(|k| lens.radial[k] * factor.powi(2 * (k as i32 + 1)));
+        }
+        self
+    }
+
     /// Takes the geometric mean of the views' own focal lengths as that of their group.
     pub fn average_focals(&mut self) {
         for (group, intrinsics) in self.intrinsics.iter_mut().enumerate() {
@@ -266,6 +276,21 @@ mod tests {
         let [lens, before] = [&found, &reconstruction].map(|of| of.intrinsics[0]);
         assert_eq!((lens.aspect, lens.radial), (1.0, [-0.2, 0.0, 0.0]));
         assert_eq!((lens.focal, lens.principal_point), (before.focal, before.principal_point));
+    }
+
+    #[test]
+    fn a_distorted_image_hardly_depends_on_the_focal_length() {
+        let mut reconstruction = testing::scene(1, 4, 10, 0.0).reconstruction();
+        let lens = &mut reconstruction.intrinsics[0];
+        (lens.radial, lens.tangential) = ([-0.2, 0.1, 0.05], [0.004, -0.003]);
+        for factor in [0.5, 2.0] {
+            let scaled = reconstruction.clone().with_scaled_focals(factor);
+            let [lens, before] = [&scaled, &reconstruction].map(|of| of.intrinsics[0]);
+            assert_eq!(lens.focal, factor * before.focal);
+            let direction = Vector3::new(0.3, -0.2, 1.0);
+            let other = Vector3::new(0.3 / factor, -0.2 / factor, 1.0);
+            assert!((lens.project(&other) - before.project(&direction)).norm() < 1e-12);
+        }
     }
 
     #[test]

@@ -136,8 +136,8 @@ pub(super) fn select_among(
     select(choice, fit, minima, model, choice.priors(fit.noise), warnings, &mut || ())
 }
 
-/// The same of the minimum near a metric reconstruction, under the model of its lenses, and of those that other focal
-/// lengths lead to; `None` where it does not converge. Others are looked for where the best may be a calibration.
+/// The same, begun at the minimum near a metric reconstruction under the model of its lenses; `None` where it does not
+/// converge. Others are looked for at other focal lengths, where the best may be a calibration.
 ///
 /// * `stretch`: as of [`grade`]
 /// * `heartbeat`: called after each minimum
@@ -186,15 +186,17 @@ fn select(
 ) -> Result<Selection, Error> {
     let first = minima.remove(best_in_front(&minima, choice.problem, fit));
     let first = Candidate::new(first, model, priors, choice.problem);
-    let projections = first.projections();
+    let (projections, priors) = (first.projections(), first.priors.clone());
     let selection = choice.select_of_any_projection(first, &mut minima, warnings)?;
-    if selection.best.model == model && selection.best.projections() == projections {
+    let best = &selection.best;
+    if best.model == model && best.priors == priors && best.projections() == projections {
         return Ok(Selection { others: minima, ..selection });
     }
     with_others(choice, selection, minima, heartbeat)
 }
 
-/// A selection with what other minima converge to under its model; a better one is taken in its place.
+/// A selection with what other minima converge to under its model: a better one is taken in its place, and those that
+/// fall back into the best are left out.
 ///
 /// * `heartbeat`: called after each
 fn with_others(

@@ -80,6 +80,13 @@ impl Candidate {
         self.minimum.reconstruction.intrinsics.iter().map(|lens| lens.projection).collect()
     }
 
+    /// Whether it costs no more than a simpler model, which is part of it, does with its priors: its adjustment ended
+    /// nowhere else.
+    fn is_no_dearer_than(&self, simpler: &Self) -> bool {
+        let optimum = simpler.optimum(simpler.model, &self.priors);
+        optimum.is_some_and(|optimum| self.minimum.cost <= simpler.fit.cost + optimum.delta_cost)
+    }
+
     /// Standard deviation of the log focal length of one group if the model is right.
     fn sigma_of_focal(&self, group: usize) -> Option<f64> {
         self.sigma(group, Parameter::LogFocal, self.model, &self.priors)
@@ -89,7 +96,7 @@ impl Candidate {
 /// The model that was chosen, and what else was adjusted on the way.
 pub(super) struct Selection {
     pub best: Candidate,
-    /// Simpler models, and richer ones that were not taken, of the same minimum, and all of them behind lenses of the
+    /// Other models of the same minimum that were adjusted, simpler and richer, and all of them behind lenses of the
     /// other projection.
     pub tried: Vec<Candidate>,
     /// Other minima under the same model.
@@ -142,7 +149,7 @@ impl Choice<'_> {
         let mut found = adjusted(from, noise);
         let options = &self.problem.options.models;
         for _ in 1..options.noise_rounds {
-            if found.fit.noise >= options.same_noise * noise {
+            if (options.same_noise..=1.0 / options.same_noise).contains(&(found.fit.noise / noise)) {
                 break;
             }
             noise = found.fit.noise;
@@ -164,13 +171,13 @@ impl Choice<'_> {
     /// The model that the data carry, from one that is near: without the extensions that they do not ask for, and with
     /// those that they do.
     fn select(&self, from: Candidate, warnings: &mut Vec<Warning>) -> Result<Selection, Error> {
-        let found = self.without_needless(from, warnings)?;
+        let found = self.without_needless(from)?;
         self.with_needed(found, warnings)
     }
 
     /// Takes away extension after extension, the least significant first, as long as there is one that the data do not
     /// ask for, or that leaves the focal length undetermined.
-    fn without_needless(&self, rich: Candidate, warnings: &mut Vec<Warning>) -> Result<Selection, Error> {
+    fn without_needless(&self, rich: Candidate) -> Result<Selection, Error> {
         let mut found = Selection { best: rich, tried: Vec::new(), others: Vec::new() };
         loop {
             let mut accepted = None;
@@ -180,7 +187,8 @@ impl Choice<'_> {
                 let model = best.model.without(extension);
                 let without = best.minimum.reconstruction.clone().of_model(model);
                 let simpler = self.adjusted(without, model, best.fit.noise);
-                if simpler.information.is_some() && !self.is_taken(&simpler, best, extension, warnings) {
+                // What is said of an extension that is not taken is said where it is added.
+                if simpler.information.is_some() && !self.is_taken(&simpler, best, extension, &mut Vec::new()) {
                     accepted = Some(simpler);
                     break;
                 }
@@ -201,9 +209,10 @@ impl Choice<'_> {
             for (extension, _) in self.promising(&found.best) {
                 Error::check(self.stop)?;
                 let model = found.best.model.with(extension);
-                let richer = match found.tried.iter().position(|tried| tried.model == model) {
-                    Some(tried) => found.tried.remove(tried),
-                    None => self.adjusted(found.best.minimum.reconstruction.clone(), model, found.best.fit.noise),
+                let tried = found.tried.iter().position(|tried| tried.model == model);
+                let richer = match tried.map(|tried| found.tried.remove(tried)) {
+                    Some(tried) if tried.is_no_dearer_than(&found.best) => tried,
+                    _ => self.adjusted(found.best.minimum.reconstruction.clone(), model, found.best.fit.noise),
                 };
                 if self.is_taken(&found.best, &richer, extension, warnings) {
                     taken = Some(richer);

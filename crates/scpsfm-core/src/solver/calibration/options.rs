@@ -275,9 +275,9 @@ options! {
         /// Share of the significant gain that a linearisation must predict for an adjustment to be tried: it is off
         /// where the richer model is far.
         worth_a_trial: f64 = 0.5,
-        /// Share of the noise that a prior was weighed by, below which what is left makes it worth weighing anew. A
-        /// prior that is weighed by a misfit's noise is too strong: with a third radial term of .4, k1 to k3 were up to
-        /// 7.4 sigma off.
+        /// Share of the noise that a prior was weighed by, below which, or beyond whose inverse, what is left makes it
+        /// worth weighing anew. A prior that is weighed by a misfit's noise is too strong: with a third radial term of
+        /// .4, k1 to k3 were up to 7.4 sigma off.
         same_noise: f64 = 0.9,
         /// Times that it is weighed at most, the first included. The noise falls by the misfit at once, and by little
         /// after.

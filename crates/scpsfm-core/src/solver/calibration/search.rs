@@ -44,7 +44,7 @@ impl Minimum {
         root_mean_square(&differences).unwrap_or(0.0)
     }
 
-    /// Whether it is the same minimum as one that is cheaper, or hardly costs more.
+    /// Whether it is the other minimum again: at the same focal lengths, and hardly dearer, or cheaper.
     ///
     /// * `counts`: one a view
     pub fn repeats(&self, other: &Self, counts: &[bool], options: &SearchOptions) -> bool {
@@ -206,8 +206,7 @@ impl Search<'_> {
         let following = Options { max_iterations: options.following_iterations, ..Options::default() };
         // Poses and points follow: freed at once, they would only go back to where they were.
         let start = |search: &Search, metric: &MetricReconstruction, factor: f64| {
-            let mut start = metric.clone();
-            start.scale_focals(factor);
+            let start = metric.clone().with_scaled_focals(factor);
             search.adjusted(&following, start, IntrinsicsModel::FIXED).reconstruction
         };
         let mut factors = options.other_focals.to_vec();

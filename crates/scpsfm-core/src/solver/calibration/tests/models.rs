@@ -161,28 +161,6 @@ fn the_lens_that_a_reconstruction_comes_with_does_not_matter() {
     }
 }
 
-/// Where no focal length is determined, no other is looked for.
-#[test]
-fn other_focal_lengths_are_compared_only_with_one_that_may_be_determined() {
-    let adjustments = |motion: Motion| {
-        let scene = testing::scene_of(1, 10, 40, NOISE, motion, false);
-        let (cameras, points) = (scene.cameras(), scene.points.iter().map(|point| point.push(1.0)).collect::<Vec<_>>());
-        let problem = of_one_lens(&cameras, &points, &scene.observations, NOISE);
-        let (prior, stop) = (problem.options.lenses.prior(NOISE, None, SIDE_PX), StopToken::default());
-        let choice = super::super::models::Choice { problem: &problem, scale_px: SIDE_PX, stop: &stop };
-        let first = choice.search(&[prior]).converged(scene.reconstruction(), IntrinsicsModel::FOCAL);
-        let fit = Fit::metric(first.cost, &first.reconstruction, IntrinsicsModel::FOCAL, &problem);
-        let mut minima = 0;
-        let mut count = || minima += 1;
-        grading::select_near(&choice, &fit, &scene.reconstruction(), None, &mut Vec::new(), &mut count)
-            .expect("nothing stops it");
-        minima
-    };
-    let others = CalibrationOptions::DEFAULT.search.other_focals.len();
-    assert_eq!(adjustments(Motion::Translation), 1);
-    assert!(adjustments(Motion::General) > others);
-}
-
 #[test]
 fn a_lens_without_distortion_is_left_without() {
     for seed in 0..10 {
