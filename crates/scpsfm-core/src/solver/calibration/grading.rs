@@ -150,21 +150,21 @@ pub(super) fn select_near(
     heartbeat: &mut dyn FnMut(),
 ) -> Result<Option<Selection>, Error> {
     let model = metric.model();
-    let Candidate { minimum, priors, .. } = &choice.adjusted(metric.clone(), model, fit.noise);
+    let first = choice.adjusted(metric.clone(), model, fit.noise);
     Error::check(choice.stop)?;
     heartbeat();
-    if !minimum.cost.is_finite() {
+    let cost = first.minimum.cost;
+    if !cost.is_finite() {
         return Ok(None);
     }
-    let first = Candidate::new(minimum.clone(), model, priors.clone(), choice.problem);
-    let mut minima = vec![minimum.clone()];
+    let mut minima = vec![first.minimum.clone()];
     let is_compared = choice.may_be_observable(&first);
     if is_compared {
-        let search = choice.search(priors);
-        minima.extend(search.minima_from_other_focals(metric, model, minimum.cost, stretch, heartbeat)?);
+        let search = choice.search(&first.priors);
+        minima.extend(search.minima_from_other_focals(metric, model, cost, stretch, heartbeat)?);
         minima = search::distinct(minima, choice.problem);
     }
-    let found = select(choice, fit, minima, model, priors.clone(), warnings, heartbeat)?;
+    let found = select(choice, fit, minima, model, first.priors, warnings, heartbeat)?;
     if is_compared || !choice.may_be_observable(&found.best) {
         return Ok(Some(found));
     }
