@@ -47,7 +47,7 @@ fn iterate(
     let mut cost = initial_cost;
     for _ in 0..STEPS {
         let mut block = PointBlock::ZERO;
-        for row in seen.iter().filter_map(|seen| Weighted::new(sequence, &position, seen, loss)) {
+        for row in seen.iter().filter_map(|seen| Weighted::new(sequence, &position, seen, &[], loss)) {
             block.add(&row.point, row.residual);
         }
         if sequence.has_common_centre {

@@ -35,13 +35,22 @@ pub(super) struct Weighted {
     /// By pose and own focal length.
     view: [[f64; VIEW]; 2],
     pub point: [Vector3<f64>; 2],
-    by_parameter: [[f64; Parameter::COUNT]; 2],
+    /// By the free intrinsics, in their order, and zeros behind them.
+    free: [[f64; Parameter::COUNT]; 2],
 }
 
 impl Weighted {
     /// `None` where the observation is undefined.
+    ///
+    /// * `parameters`: those of the intrinsics that are free
     #[inline(always)]
-    pub fn new(sequence: &MetricReconstruction, point: &Vector3<f64>, seen: &Seen, loss: Loss) -> Option<Self> {
+    pub fn new(
+        sequence: &MetricReconstruction,
+        point: &Vector3<f64>,
+        seen: &Seen,
+        parameters: &[Parameter],
+        loss: Loss,
+    ) -> Option<Self> {
         let intrinsics = sequence.intrinsics_of(seen.view);
         let projection = Projection::new(&intrinsics, &sequence.poses[seen.view], point);
         let residual = projection.image - seen.xy;
@@ -57,7 +66,12 @@ impl Weighted {
                 [a * root, b * root, c * root, x * of_shift, y * of_shift, z * of_shift, focal]
             }),
             point: by_point.map(|row| row * root),
-            by_parameter: by_parameter.map(|row| row.map(|value| value * root)),
+            free: by_parameter.map(|row| {
+                let mut free = [0.0; Parameter::COUNT];
+                let chosen = parameters.iter().map(|parameter| row[*parameter as usize] * root);
+                free.iter_mut().zip(chosen).for_each(|(slot, value)| *slot = value);
+                free
+            }),
         })
     }
 }
@@ -198,11 +212,11 @@ impl Points<'_> {
             let couplings = split_off(&mut couplings, layout.couplings(point).len());
             couplings.fill(0.0);
             for (seen, slot) in seen.iter().zip(split_off(&mut rows, seen.len())) {
-                *slot = Weighted::new(sequence, &sequence.points[point], seen, loss);
+                let parameters = &layout.unknowns.parameters[sequence.group_of[seen.view]];
+                *slot = Weighted::new(sequence, &sequence.points[point], seen, parameters, loss);
                 if let Some(row) = slot {
                     block.add(&row.point, row.residual);
-                    let parameters = &layout.unknowns.parameters[sequence.group_of[seen.view]];
-                    row.link_blocks(seen, layout.unknowns.of_view(seen.view), parameters, couplings);
+                    row.link_blocks(seen, layout.unknowns.of_view(seen.view), parameters.len(), couplings);
                 }
             }
             if sequence.has_common_centre {
@@ -325,8 +339,7 @@ impl Batch<'_> {
                 add_to_view(values, within(place), unknowns, &row.view, own);
                 add_gradient(gradient, own, row.residual);
                 if let Some(cross) = cross {
-                    let free = row.free(parameters);
-                    add_product(values, within(cross), chosen(&free, parameters), own);
+                    add_product(values, within(cross), row.by_intrinsics(parameters.len()), own);
                 }
             }
         }
@@ -346,9 +359,7 @@ impl Batch<'_> {
                 return false;
             }
             let (Some((first, place)), Some(row)) = (self.places[seen.view].group, row) else { continue };
-            let parameters = &self.parameters[self.group_of[seen.view]];
-            let free = row.free(parameters);
-            let free = chosen(&free, parameters);
+            let free = row.by_intrinsics(self.parameters[self.group_of[seen.view]].len());
             add_product(values, Place { start: place.start - first_value, ..place }, free, free);
             add_gradient(&mut gradient[first - first_unknown..], free, row.residual);
         }
@@ -357,37 +368,27 @@ impl Batch<'_> {
 }
 
 impl Weighted {
-    /// Derivatives by the free intrinsics, in their order, and zeros behind them.
+    /// Derivatives by the free intrinsics, so many.
     #[inline(always)]
-    fn free(&self, parameters: &[Parameter]) -> [[f64; Parameter::COUNT]; 2] {
-        self.by_parameter.map(|by_parameter| {
-            let mut free = [0.0; Parameter::COUNT];
-            free.iter_mut().zip(parameters).for_each(|(value, parameter)| *value = by_parameter[*parameter as usize]);
-            free
-        })
+    fn by_intrinsics(&self, count: usize) -> [&[f64]; 2] {
+        [&self.free[0][..count], &self.free[1][..count]]
     }
 
     /// Adds this observation to the couplings of its point.
     ///
     /// * `unknowns`: of the view
+    /// * `parameters`: how many intrinsics are free
     #[inline(always)]
-    fn link_blocks(&self, seen: &Seen, unknowns: usize, parameters: &[Parameter], couplings: &mut [f64]) {
+    fn link_blocks(&self, seen: &Seen, unknowns: usize, parameters: usize, couplings: &mut [f64]) {
         let point = [self.point[0].as_slice(), self.point[1].as_slice()];
         if let Some(start) = seen.view_coupling {
             add_to_view(couplings, Place { start: start as usize, stride: unknowns }, unknowns, &self.view, point);
         }
         if let Some(start) = seen.group_coupling {
-            let free = self.free(parameters);
-            let place = Place { start: start as usize, stride: parameters.len() };
-            add_product(couplings, place, chosen(&free, parameters), point);
+            let place = Place { start: start as usize, stride: parameters };
+            add_product(couplings, place, self.by_intrinsics(parameters), point);
         }
     }
-}
-
-/// What there is of the derivatives by the free intrinsics.
-#[inline(always)]
-fn chosen<'f>(free: &'f [[f64; Parameter::COUNT]; 2], parameters: &[Parameter]) -> [&'f [f64]; 2] {
-    [&free[0][..parameters.len()], &free[1][..parameters.len()]]
 }
 
 /// Adds `rows' columns` to a block of as many rows as a view has unknowns.
