@@ -137,7 +137,10 @@ pub(super) fn select_among(
 }
 
 /// The same, begun at the minimum near a metric reconstruction under the model of its lenses; `None` where it does not
-/// converge. Others are looked for at other focal lengths, where the best may be a calibration.
+/// converge. Others are looked for at other focal lengths.
+///
+/// Where the focal length is not determined under that model, no other is tried: it was chosen among those that
+/// determine the focal length, from fewer observations.
 ///
 /// * `stretch`: as of [`grade`]
 /// * `heartbeat`: called after each minimum
@@ -150,28 +153,21 @@ pub(super) fn select_near(
     heartbeat: &mut dyn FnMut(),
 ) -> Result<Option<Selection>, Error> {
     let model = metric.model();
-    let first = choice.adjusted(metric.clone(), model, fit.noise);
+    let near = choice.adjusted(metric.clone(), model, fit.noise);
     Error::check(choice.stop)?;
     heartbeat();
-    let cost = first.minimum.cost;
+    let cost = near.minimum.cost;
     if !cost.is_finite() {
         return Ok(None);
     }
-    let mut minima = vec![first.minimum.clone()];
-    let is_compared = choice.may_be_observable(&first);
-    if is_compared {
-        let search = choice.search(&first.priors);
-        minima.extend(search.minima_from_other_focals(metric, model, cost, stretch, heartbeat)?);
-        minima = search::distinct(minima, choice.problem);
+    if !choice.may_be_observable(&near) {
+        return Ok(Some(Selection::of(near)));
     }
-    let found = select(choice, fit, minima, model, first.priors, warnings, heartbeat)?;
-    if is_compared || !choice.may_be_observable(&found.best) {
-        return Ok(Some(found));
-    }
-    let Candidate { minimum: Minimum { reconstruction, cost, .. }, model, priors, .. } = &found.best;
-    let search = choice.search(priors);
-    let others = search.minima_from_other_focals(reconstruction, *model, *cost, stretch, heartbeat)?;
-    with_others(choice, found, others, heartbeat).map(Some)
+    let search = choice.search(&near.priors);
+    let mut minima = vec![near.minimum.clone()];
+    minima.extend(search.minima_from_other_focals(metric, model, cost, stretch, heartbeat)?);
+    let minima = search::distinct(minima, choice.problem);
+    select(choice, fit, minima, model, near.priors, warnings, heartbeat).map(Some)
 }
 
 /// * `minima`: not empty, cheapest first, of this model with these priors

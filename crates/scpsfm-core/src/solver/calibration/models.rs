@@ -104,6 +104,11 @@ pub(super) struct Selection {
 }
 
 impl Selection {
+    /// Of a candidate without anything else tried.
+    pub fn of(best: Candidate) -> Self {
+        Self { best, tried: Vec::new(), others: Vec::new() }
+    }
+
     /// Puts another minimum in place of the best, of which nothing else was adjusted; returns what was the best. What
     /// was tried of the other projection is kept: it explains the same observations.
     pub fn replace(&mut self, better: Candidate) -> Candidate {
@@ -178,7 +183,7 @@ impl Choice<'_> {
     /// Takes away extension after extension, the least significant first, as long as there is one that the data do not
     /// ask for, or that leaves the focal length undetermined.
     fn without_needless(&self, rich: Candidate) -> Result<Selection, Error> {
-        let mut found = Selection { best: rich, tried: Vec::new(), others: Vec::new() };
+        let mut found = Selection::of(rich);
         loop {
             let mut accepted = None;
             for extension in self.doubtful(&found.best) {
@@ -286,17 +291,21 @@ impl Choice<'_> {
         Ok(found)
     }
 
-    /// Whether the focal length of a group, or of a view that has its own, may be determined well enough for a
-    /// calibration. The limit is above that of WEAK by `sigma_inflation`: averaging over models may lower sigma.
+    /// Whether the focal length of a group, or of as many views as a calibration takes where each has its own, may be
+    /// determined well enough. The limit is above that of WEAK by `sigma_inflation`: averaging over models may lower
+    /// sigma.
     pub fn may_be_observable(&self, best: &Candidate) -> bool {
         let CalibrationOptions { models, grades, .. } = self.problem.options;
         let is_small = |sigma: f64| sigma <= models.sigma_inflation * grades.weak_up_to;
-        if (0..self.problem.groups()).any(|group| best.sigma_of_focal(group).is_some_and(is_small)) {
-            return true;
+        let focals = &best.minimum.reconstruction.focals;
+        if focals.is_empty() {
+            return (0..self.problem.groups()).any(|group| best.sigma_of_focal(group).is_some_and(is_small));
         }
         let optimum = best.optimum(best.model, &best.priors);
         let of_views = optimum.map(|optimum| best.own_focals(&optimum)).unwrap_or_default();
-        of_views.iter().any(|(variance, _)| variance.is_some_and(|variance| is_small(variance.sqrt() * best.fit.noise)))
+        let is_determined = |variance: &f64| is_small(variance.sqrt() * best.fit.noise);
+        let determined = of_views.iter().filter_map(|(variance, _)| *variance).filter(is_determined).count();
+        determined as f64 >= grades.least_determined * focals.len() as f64
     }
 
     /// The largest radius at unit depth at which each group observes whose lens is to be replaced; `None` where none is.

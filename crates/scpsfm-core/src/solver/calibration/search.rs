@@ -243,16 +243,18 @@ impl Search<'_> {
         self.converged_all(found.into_iter().map(in_groups), IntrinsicsModel::FOCAL, &mut || ())
     }
 
-    /// With a focal length a view, of which nothing is known: from the quadrics that allow for that, and from what one
-    /// for all leads to.
+    /// With a focal length a view, of which nothing is known: from the quadrics that allow for that, and from the starts
+    /// with one for all.
     fn minima_per_view(&self, frame: &CanonicalFrame) -> Result<Vec<Minimum>, Error> {
         let (model, search) = (IntrinsicsModel::FOCAL_PER_VIEW, Search { priors: &[IntrinsicsPrior::NONE], ..*self });
         let (problem, options) = (self.problem, &self.problem.options.search);
         let quadrics = daq::view_focal_starts(&frame.cameras).into_iter().take(options.starts);
         let mut starts: Vec<MetricReconstruction> =
             quadrics.filter_map(|(daq, _)| upgrade(frame, &daq, true, problem.observations)).collect();
-        let of_one = search.minima_of_one(frame)?;
-        starts.extend(of_one.into_iter().map(|minimum| minimum.reconstruction.with_own_focals()));
+        let thinned = Thinned::new(frame, problem);
+        let on_some = Search { problem: &thinned.problem(problem), ..search };
+        let of_one = on_some.starts_of_one(frame)?.into_iter();
+        starts.extend(of_one.map(|start| thinned.completed(start.reconstruction, problem).with_own_focals()));
         let mut found = Vec::with_capacity(starts.len());
         for reconstruction in starts {
             Error::check(self.stop)?;
@@ -266,33 +268,35 @@ impl Search<'_> {
     /// With one focal length for all views.
     fn minima_of_one(&self, frame: &CanonicalFrame) -> Result<Vec<Minimum>, Error> {
         let (model, problem) = (IntrinsicsModel::FOCAL, self.problem);
-        let options = &problem.options.search;
-        let (subset, chosen) = subsample(frame, problem.observations, options);
-        let subset = Uncalibrated { observations: subset.as_deref().unwrap_or(problem.observations), ..*problem };
-        let on_subset = Search { problem: &subset, ..*self };
-        let mut found: Vec<Minimum> = Vec::new();
-        for start in starts(frame, options) {
-            Error::check(self.stop)?;
-            let Some(start) = upgrade(frame, &start, false, subset.observations) else { continue };
-            found.push(on_subset.adjusted(&options.first(), start, model));
-        }
-        let mut found = distinct(found, problem);
-        found.truncate(options.converged);
-        let mut converged: Vec<Minimum> = Vec::with_capacity(found.len());
+        let thinned = Thinned::new(frame, problem);
+        let on_some = Search { problem: &thinned.problem(problem), ..*self };
+        let mut converged: Vec<Minimum> = Vec::new();
         let mut cheapest = f64::INFINITY;
-        for start in found {
+        for start in on_some.starts_of_one(frame)? {
             Error::check(self.stop)?;
-            let Some(mut minimum) = on_subset.converged_near(start.reconstruction, model, cheapest) else { continue };
+            let Some(mut minimum) = on_some.converged_near(start.reconstruction, model, cheapest) else { continue };
             cheapest = cheapest.min(minimum.cost);
-            if let Some(chosen) = &chosen {
-                let took_no_part: Vec<bool> = chosen.iter().map(|chosen| !chosen).collect();
-                retriangulate(&mut minimum.reconstruction, problem.observations, &took_no_part);
-                minimum = self.converged(minimum.reconstruction, model);
+            if thinned.observations.is_some() {
+                minimum = self.converged(thinned.completed(minimum.reconstruction, problem), model);
             }
             converged.push(minimum);
         }
         Error::check(self.stop)?;
         Ok(distinct(converged, problem))
+    }
+
+    /// The best starts with one focal length for all views after their first steps, cheapest first.
+    fn starts_of_one(&self, frame: &CanonicalFrame) -> Result<Vec<Minimum>, Error> {
+        let options = &self.problem.options.search;
+        let mut found: Vec<Minimum> = Vec::new();
+        for start in starts(frame, options) {
+            Error::check(self.stop)?;
+            let Some(start) = upgrade(frame, &start, false, self.problem.observations) else { continue };
+            found.push(self.adjusted(&options.first(), start, IntrinsicsModel::FOCAL));
+        }
+        let mut found = distinct(found, self.problem);
+        found.truncate(options.converged);
+        Ok(found)
     }
 
     /// What starts that were found otherwise than by the quadric converge to, cheapest first.
@@ -372,29 +376,47 @@ fn starts(frame: &CanonicalFrame, options: &SearchOptions) -> Vec<Daq> {
     kept
 }
 
-/// Every so many-th point, when there are more than the search needs: their observations, and which were chosen.
-fn subsample(
-    frame: &CanonicalFrame,
-    observations: &[Observation],
-    options: &SearchOptions,
-) -> (Option<Vec<Observation>>, Option<Vec<bool>>) {
-    let points = frame.points.len();
-    if points <= options.points {
-        return (None, None);
-    }
-    let mut chosen = vec![false; points];
-    (0..options.points).for_each(|k| chosen[k * points / options.points] = true);
-    // A view that would be left with too few points keeps all of its own.
-    let mut left = vec![0usize; frame.cameras.len()];
-    let in_range = |seen: &&Observation| seen.view < frame.cameras.len() && seen.point < points;
-    for seen in observations.iter().filter(in_range) {
-        left[seen.view] += usize::from(chosen[seen.point]);
-    }
-    for seen in observations.iter().filter(in_range) {
-        if left[seen.view] < options.least_points_of_view {
-            chosen[seen.point] = true;
+/// Every so many-th point, where there are more than the search needs.
+struct Thinned {
+    /// Those of the points that were chosen; `None`: all were.
+    observations: Option<Vec<Observation>>,
+    was_left_out: Vec<bool>,
+}
+
+impl Thinned {
+    fn new(frame: &CanonicalFrame, problem: &Uncalibrated) -> Self {
+        let (points, options) = (frame.points.len(), &problem.options.search);
+        if points <= options.points {
+            return Self { observations: None, was_left_out: vec![false; points] };
+        }
+        let mut chosen = vec![false; points];
+        (0..options.points).for_each(|k| chosen[k * points / options.points] = true);
+        // A view that would be left with too few points keeps all of its own.
+        let mut left = vec![0usize; frame.cameras.len()];
+        let in_range = |seen: &&Observation| seen.view < frame.cameras.len() && seen.point < points;
+        for seen in problem.observations.iter().filter(in_range) {
+            left[seen.view] += usize::from(chosen[seen.point]);
+        }
+        for seen in problem.observations.iter().filter(in_range) {
+            if left[seen.view] < options.least_points_of_view {
+                chosen[seen.point] = true;
+            }
+        }
+        let of_chosen = |seen: &&Observation| in_range(seen) && chosen[seen.point];
+        Self {
+            observations: Some(problem.observations.iter().filter(of_chosen).copied().collect()),
+            was_left_out: chosen.iter().map(|chosen| !chosen).collect(),
         }
     }
-    let subset = observations.iter().filter(in_range).filter(|seen| chosen[seen.point]).copied().collect();
-    (Some(subset), Some(chosen))
+
+    /// The problem with the observations of these points.
+    fn problem<'p>(&'p self, whole: &Uncalibrated<'p>) -> Uncalibrated<'p> {
+        Uncalibrated { observations: self.observations.as_deref().unwrap_or(whole.observations), ..*whole }
+    }
+
+    /// A reconstruction that was found from these points with the others triangulated.
+    fn completed(&self, mut found: MetricReconstruction, whole: &Uncalibrated) -> MetricReconstruction {
+        retriangulate(&mut found, whole.observations, &self.was_left_out);
+        found
+    }
 }
