@@ -139,8 +139,8 @@ pub(super) fn select_among(
 /// The same, begun at the minimum near a metric reconstruction under the model of its lenses; `None` where it does not
 /// converge. Others are looked for at other focal lengths.
 ///
-/// Where the focal length is not determined under that model, no other is tried: it was chosen among those that
-/// determine the focal length, from fewer observations.
+/// Where no focal length may be determined under that model, nothing else is tried: of 20 such calibrations among 309 no
+/// other model determined one either.
 ///
 /// * `stretch`: as of [`grade`]
 /// * `heartbeat`: called after each minimum
@@ -160,14 +160,13 @@ pub(super) fn select_near(
     if !cost.is_finite() {
         return Ok(None);
     }
-    if !choice.may_be_observable(&near) {
+    if !choice.may_be_observable(&near, fit) {
         return Ok(Some(Selection::of(near)));
     }
-    let search = choice.search(&near.priors);
-    let mut minima = vec![near.minimum.clone()];
-    minima.extend(search.minima_from_other_focals(metric, model, cost, stretch, heartbeat)?);
-    let minima = search::distinct(minima, choice.problem);
-    select(choice, fit, minima, model, near.priors, warnings, heartbeat).map(Some)
+    let Candidate { minimum, priors, .. } = near;
+    let others = choice.search(&priors).minima_from_other_focals(metric, model, cost, stretch, heartbeat)?;
+    let minima = search::distinct(std::iter::once(minimum).chain(others).collect(), choice.problem);
+    select(choice, fit, minima, model, priors, warnings, heartbeat).map(Some)
 }
 
 /// * `minima`: not empty, cheapest first, of this model with these priors

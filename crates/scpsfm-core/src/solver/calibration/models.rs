@@ -294,18 +294,21 @@ impl Choice<'_> {
     /// Whether the focal length of a group, or of as many views as a calibration takes where each has its own, may be
     /// determined well enough. The limit is above that of WEAK by `sigma_inflation`: averaging over models may lower
     /// sigma.
-    pub fn may_be_observable(&self, best: &Candidate) -> bool {
+    ///
+    /// * `fit`: of projective cameras; a lens that does not fit adds to their noise
+    pub fn may_be_observable(&self, best: &Candidate, fit: &Fit) -> bool {
         let CalibrationOptions { models, grades, .. } = self.problem.options;
-        let is_small = |sigma: f64| sigma <= models.sigma_inflation * grades.weak_up_to;
+        let Some(optimum) = best.optimum(best.model, &best.priors) else { return false };
+        let limit = models.sigma_inflation * grades.weak_up_to;
+        let noise = best.fit.noise.min(fit.noise);
+        let is_small = |variance: &f64| variance.sqrt() * noise <= limit;
         let focals = &best.minimum.reconstruction.focals;
         if focals.is_empty() {
-            return (0..self.problem.groups()).any(|group| best.sigma_of_focal(group).is_some_and(is_small));
+            let variance = |group: usize| optimum.variance_of(group, Parameter::LogFocal);
+            return (0..self.problem.groups()).filter_map(variance).any(|variance| is_small(&variance));
         }
-        let optimum = best.optimum(best.model, &best.priors);
-        let of_views = optimum.map(|optimum| best.own_focals(&optimum)).unwrap_or_default();
-        let is_determined = |variance: &f64| is_small(variance.sqrt() * best.fit.noise);
-        let determined = of_views.iter().filter_map(|(variance, _)| *variance).filter(is_determined).count();
-        determined as f64 >= grades.least_determined * focals.len() as f64
+        let determined = best.own_focals(&optimum).into_iter().filter_map(|(variance, _)| variance).filter(is_small);
+        determined.count() as f64 >= grades.least_determined * focals.len() as f64
     }
 
     /// The largest radius at unit depth at which each group observes whose lens is to be replaced; `None` where none is.

@@ -24,6 +24,13 @@ pub(super) struct Minimum {
     pub cheirality: f64,
 }
 
+impl Uncalibrated<'_> {
+    /// The same by the observations of these points; all of them where there are none.
+    fn on_subset<'s>(&'s self, thinned: Option<&'s Thinned>) -> Uncalibrated<'s> {
+        Uncalibrated { observations: thinned.map_or(self.observations, |thinned| &thinned.observations), ..*self }
+    }
+}
+
 impl Minimum {
     /// Of the geometric mean where views or groups have their own.
     pub fn log_focal(&self) -> f64 {
@@ -252,9 +259,14 @@ impl Search<'_> {
         let mut starts: Vec<MetricReconstruction> =
             quadrics.filter_map(|(daq, _)| upgrade(frame, &daq, true, problem.observations)).collect();
         let thinned = Thinned::new(frame, problem);
-        let on_some = Search { problem: &thinned.problem(problem), ..search };
-        let of_one = on_some.starts_of_one(frame)?.into_iter();
-        starts.extend(of_one.map(|start| thinned.completed(start.reconstruction, problem).with_own_focals()));
+        let on_subset = Search { problem: &problem.on_subset(thinned.as_ref()), ..search };
+        for start in on_subset.starts_of_one(frame)? {
+            let start = start.reconstruction.with_own_focals();
+            starts.push(match &thinned {
+                Some(thinned) => thinned.completed(start, problem.observations),
+                None => start,
+            });
+        }
         let mut found = Vec::with_capacity(starts.len());
         for reconstruction in starts {
             Error::check(self.stop)?;
@@ -269,15 +281,16 @@ impl Search<'_> {
     fn minima_of_one(&self, frame: &CanonicalFrame) -> Result<Vec<Minimum>, Error> {
         let (model, problem) = (IntrinsicsModel::FOCAL, self.problem);
         let thinned = Thinned::new(frame, problem);
-        let on_some = Search { problem: &thinned.problem(problem), ..*self };
+        let on_subset = Search { problem: &problem.on_subset(thinned.as_ref()), ..*self };
         let mut converged: Vec<Minimum> = Vec::new();
         let mut cheapest = f64::INFINITY;
-        for start in on_some.starts_of_one(frame)? {
+        for start in on_subset.starts_of_one(frame)? {
             Error::check(self.stop)?;
-            let Some(mut minimum) = on_some.converged_near(start.reconstruction, model, cheapest) else { continue };
+            let Some(mut minimum) = on_subset.converged_near(start.reconstruction, model, cheapest) else { continue };
             cheapest = cheapest.min(minimum.cost);
-            if thinned.observations.is_some() {
-                minimum = self.converged(thinned.completed(minimum.reconstruction, problem), model);
+            if let Some(thinned) = &thinned {
+                let start = thinned.completed(minimum.reconstruction, problem.observations);
+                minimum = self.converged(start, model);
             }
             converged.push(minimum);
         }
@@ -285,7 +298,8 @@ impl Search<'_> {
         Ok(distinct(converged, problem))
     }
 
-    /// The best starts with one focal length for all views after their first steps, cheapest first.
+    /// The best starts with one focal length for all views after their first steps, which are no minima yet, cheapest
+    /// first.
     fn starts_of_one(&self, frame: &CanonicalFrame) -> Result<Vec<Minimum>, Error> {
         let options = &self.problem.options.search;
         let mut found: Vec<Minimum> = Vec::new();
@@ -378,16 +392,17 @@ fn starts(frame: &CanonicalFrame, options: &SearchOptions) -> Vec<Daq> {
 
 /// Every so many-th point, where there are more than the search needs.
 struct Thinned {
-    /// Those of the points that were chosen; `None`: all were.
-    observations: Option<Vec<Observation>>,
+    /// Those of the points that were chosen.
+    observations: Vec<Observation>,
     was_left_out: Vec<bool>,
 }
 
 impl Thinned {
-    fn new(frame: &CanonicalFrame, problem: &Uncalibrated) -> Self {
+    /// `None` where all points take part.
+    fn new(frame: &CanonicalFrame, problem: &Uncalibrated) -> Option<Self> {
         let (points, options) = (frame.points.len(), &problem.options.search);
         if points <= options.points {
-            return Self { observations: None, was_left_out: vec![false; points] };
+            return None;
         }
         let mut chosen = vec![false; points];
         (0..options.points).for_each(|k| chosen[k * points / options.points] = true);
@@ -403,20 +418,15 @@ impl Thinned {
             }
         }
         let of_chosen = |seen: &&Observation| in_range(seen) && chosen[seen.point];
-        Self {
-            observations: Some(problem.observations.iter().filter(of_chosen).copied().collect()),
+        Some(Self {
+            observations: problem.observations.iter().filter(of_chosen).copied().collect(),
             was_left_out: chosen.iter().map(|chosen| !chosen).collect(),
-        }
-    }
-
-    /// The problem with the observations of these points.
-    fn problem<'p>(&'p self, whole: &Uncalibrated<'p>) -> Uncalibrated<'p> {
-        Uncalibrated { observations: self.observations.as_deref().unwrap_or(whole.observations), ..*whole }
+        })
     }
 
     /// A reconstruction that was found from these points with the others triangulated.
-    fn completed(&self, mut found: MetricReconstruction, whole: &Uncalibrated) -> MetricReconstruction {
-        retriangulate(&mut found, whole.observations, &self.was_left_out);
+    fn completed(&self, mut found: MetricReconstruction, observations: &[Observation]) -> MetricReconstruction {
+        retriangulate(&mut found, observations, &self.was_left_out);
         found
     }
 }

@@ -22,8 +22,8 @@ use crate::simd::vectorised;
 struct ViewPlaces {
     /// First unknown of the view, its unknowns and its diagonal block.
     view: Option<(usize, usize, Place)>,
-    /// First unknown of the intrinsics and their diagonal block.
-    group: Option<(usize, Place)>,
+    /// First unknown of the intrinsics, how many are free, and their diagonal block.
+    group: Option<(usize, usize, Place)>,
     /// Block of intrinsics and view.
     cross: Option<Place>,
 }
@@ -124,10 +124,6 @@ enum Sums<'a> {
 struct Batch<'a> {
     places: &'a [ViewPlaces],
     before: &'a [(usize, usize)],
-    /// Free intrinsics of each group.
-    parameters: &'a [Vec<Parameter>],
-    /// Group of each view.
-    group_of: &'a [usize],
     /// Where the batch begins among all observations.
     first: usize,
     rows: &'a [Option<Weighted>],
@@ -159,8 +155,7 @@ impl Normal {
         self.cameras.gradient.fill(0.0);
         self.cameras.add_priors(sequence, pool.layout, priors);
         pool.batches().all(|points| {
-            self.linearise(sequence, loss, pool, points.clone())
-                && self.cameras.add_batch(sequence, pool, points, &self.rows)
+            self.linearise(sequence, loss, pool, points.clone()) && self.cameras.add_batch(pool, points, &self.rows)
         })
     }
 
@@ -231,13 +226,14 @@ impl Points<'_> {
 impl Cameras {
     fn new(layout: &Layout, pattern: &Pattern, sequence: &MetricReconstruction) -> Self {
         let unknowns = &layout.unknowns;
-        let diagonal = |block: usize| Some((unknowns.range(block).start, pattern.place(block, block)?));
         let places = |view: usize| {
             let (own, group) = (unknowns.view_block[view], unknowns.group_block_of_view(sequence, view));
-            let sized =
-                |block: usize| diagonal(block).map(|(first, place)| (first, unknowns.range(block).len(), place));
+            let diagonal = |block: usize| {
+                let range = unknowns.range(block);
+                Some((range.start, range.len(), pattern.place(block, block)?))
+            };
             ViewPlaces {
-                view: own.and_then(sized),
+                view: own.and_then(diagonal),
                 group: group.and_then(diagonal),
                 cross: own.zip(group).and_then(|(own, group)| pattern.place(group, own)),
             }
@@ -270,13 +266,7 @@ impl Cameras {
     }
 
     /// Adds the rows of a batch; `false` when it was stopped.
-    fn add_batch(
-        &mut self,
-        sequence: &MetricReconstruction,
-        pool: &WorkerPool,
-        points: Range<usize>,
-        rows: &[Option<Weighted>],
-    ) -> bool {
+    fn add_batch(&mut self, pool: &WorkerPool, points: Range<usize>, rows: &[Option<Weighted>]) -> bool {
         let Self { places, values, gradient, before, by_view, .. } = self;
         let layout = pool.layout;
         let seen = layout.seen_range(points);
@@ -294,8 +284,7 @@ impl Cameras {
         let mut pieces: Vec<Sums> = even_cuts(pool.threads.pieces(), weights).windows(2).map(cut).collect();
         // First, for nobody can share it.
         pieces.insert(0, Sums::Groups { values, gradient });
-        let (parameters, group_of) = (layout.unknowns.parameters.as_slice(), sequence.group_of.as_slice());
-        let batch = Batch { places, before, parameters, group_of, first: seen.start, rows, pool };
+        let batch = Batch { places, before, first: seen.start, rows, pool };
         pool.threads.each(pieces, |piece: Sums| {
             vectorised(
                 #[inline(always)]
@@ -327,9 +316,8 @@ impl Batch<'_> {
         let (first_value, first_unknown) = self.before[views.start];
         let within = |place: Place| Place { start: place.start - first_value, ..place };
         for view in views {
-            let ViewPlaces { view: Some((first, unknowns, place)), cross, .. } = self.places[view] else { continue };
+            let ViewPlaces { view: Some((first, unknowns, place)), group, cross } = self.places[view] else { continue };
             let gradient = &mut gradient[first - first_unknown..];
-            let parameters = &self.parameters[self.group_of[view]];
             for &k in seen(view) {
                 if !cancellation.may_go_on(1) {
                     return false;
@@ -338,8 +326,8 @@ impl Batch<'_> {
                 let own = [&row.view[0][..unknowns], &row.view[1][..unknowns]];
                 add_to_view(values, within(place), unknowns, &row.view, own);
                 add_gradient(gradient, own, row.residual);
-                if let Some(cross) = cross {
-                    add_product(values, within(cross), row.by_intrinsics(parameters.len()), own);
+                if let Some(((_, free, _), cross)) = group.zip(cross) {
+                    add_product(values, within(cross), row.by_intrinsics(free), own);
                 }
             }
         }
@@ -358,8 +346,8 @@ impl Batch<'_> {
             if !cancellation.may_go_on(1) {
                 return false;
             }
-            let (Some((first, place)), Some(row)) = (self.places[seen.view].group, row) else { continue };
-            let free = row.by_intrinsics(self.parameters[self.group_of[seen.view]].len());
+            let (Some((first, free, place)), Some(row)) = (self.places[seen.view].group, row) else { continue };
+            let free = row.by_intrinsics(free);
             add_product(values, Place { start: place.start - first_value, ..place }, free, free);
             add_gradient(&mut gradient[first - first_unknown..], free, row.residual);
         }
@@ -368,25 +356,25 @@ impl Batch<'_> {
 }
 
 impl Weighted {
-    /// Derivatives by the free intrinsics, so many.
+    /// Derivatives by the intrinsics, of which so many are free.
     #[inline(always)]
-    fn by_intrinsics(&self, count: usize) -> [&[f64]; 2] {
-        [&self.free[0][..count], &self.free[1][..count]]
+    fn by_intrinsics(&self, free: usize) -> [&[f64]; 2] {
+        [&self.free[0][..free], &self.free[1][..free]]
     }
 
     /// Adds this observation to the couplings of its point.
     ///
     /// * `unknowns`: of the view
-    /// * `parameters`: how many intrinsics are free
+    /// * `free`: how many intrinsics are
     #[inline(always)]
-    fn link_blocks(&self, seen: &Seen, unknowns: usize, parameters: usize, couplings: &mut [f64]) {
+    fn link_blocks(&self, seen: &Seen, unknowns: usize, free: usize, couplings: &mut [f64]) {
         let point = [self.point[0].as_slice(), self.point[1].as_slice()];
         if let Some(start) = seen.view_coupling {
             add_to_view(couplings, Place { start: start as usize, stride: unknowns }, unknowns, &self.view, point);
         }
         if let Some(start) = seen.group_coupling {
-            let place = Place { start: start as usize, stride: parameters };
-            add_product(couplings, place, self.by_intrinsics(parameters), point);
+            let place = Place { start: start as usize, stride: free };
+            add_product(couplings, place, self.by_intrinsics(free), point);
         }
     }
 }
