@@ -139,8 +139,8 @@ pub(super) fn select_among(
 /// The same, begun at the minimum near a metric reconstruction under the model of its lenses; `None` where it does not
 /// converge. Others are looked for at other focal lengths.
 ///
-/// Where no focal length may be determined under that model, nothing else is tried: of 20 such calibrations among 309 no
-/// other model determined one either.
+/// Where no focal length may be determined under that model, nothing else is tried: in 20 such calibrations of 309 no
+/// other model determined one either, and all were refused.
 ///
 /// * `stretch`: as of [`grade`]
 /// * `heartbeat`: called after each minimum

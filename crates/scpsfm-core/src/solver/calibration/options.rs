@@ -125,8 +125,8 @@ options! {
         same_plane: f64 = 0.05,
         /// Focal lengths that the refinement may end at; beyond, it ran away along a null direction.
         refined_focals: std::ops::RangeInclusive<f64> = 0.05..=50.0,
-        /// Iterations and tolerance of the first adjustment, which only has to rank the starts, and from which those with a
-        /// focal length a view begin.
+        /// Iterations and tolerance of the first adjustment, which only has to rank the starts, and after which those
+        /// with a focal length a view begin from those with one for all.
         first_iterations: usize = 12,
         first_tolerance: f64 = 1e-4,
         /// Starts that are adjusted to convergence, and the iterations and the tolerance allowed.

@@ -250,8 +250,8 @@ impl Search<'_> {
         self.converged_all(found.into_iter().map(in_groups), IntrinsicsModel::FOCAL, &mut || ())
     }
 
-    /// With a focal length a view, of which nothing is known: from the quadrics that allow for that, and from the starts
-    /// with one for all.
+    /// With a focal length a view, of which nothing is known: from the quadrics that allow for that, and from the
+    /// starts with one for all.
     fn minima_per_view(&self, frame: &CanonicalFrame) -> Result<Vec<Minimum>, Error> {
         let (model, search) = (IntrinsicsModel::FOCAL_PER_VIEW, Search { priors: &[IntrinsicsPrior::NONE], ..*self });
         let (problem, options) = (self.problem, &self.problem.options.search);
