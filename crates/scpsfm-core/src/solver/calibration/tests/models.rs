@@ -161,6 +161,36 @@ fn the_lens_that_a_reconstruction_comes_with_does_not_matter() {
     }
 }
 
+/// A lens with a needless radial term keeps it where cameras turn by a twentieth of a degree, and loses it where they
+/// turn by one. Steps are two of what is compared with, one of the minimum, and one of each other focal length; a
+/// camera that turns no more than noise is refused after the first two.
+#[test]
+fn nothing_else_is_tried_where_the_lens_leaves_the_focal_length_open() {
+    let (mut open, mut determined) = (0, 0);
+    for (max_rotation_rad, seed) in (0..20).map(|seed| (0.001, seed)).chain((0..5).map(|seed| (0.02, seed))) {
+        let scene = testing::scene_turning(seed, 60, 0.001, max_rotation_rad);
+        let mut metric = scene.reconstruction();
+        metric.intrinsics[0].radial[0] = -0.01;
+        let points: Vec<Vector4<f64>> = scene.points.iter().map(|point| point.push(1.0)).collect();
+        let cameras = scene.cameras();
+        let problem = of_one_lens(&cameras, &points, &scene.observations, 0.001);
+        let mut steps = 0;
+        let outcomes = from_metric(&problem, &metric, None, SIDE_PX, &StopToken::default(), &mut || steps += 1);
+        let Outcome { grade, sigma_log_focal, model, .. } = only(outcomes);
+        let of = format!("turning by {max_rotation_rad}, seed {seed}");
+        println!("{of}: {grade:?} {sigma_log_focal:?} after {steps} steps, {}", model.name());
+        if steps == 3 {
+            open += 1;
+            assert_eq!((grade, model), (Grade::ProjectiveOnly, metric.model()), "{of}");
+        }
+        if grade != Grade::ProjectiveOnly {
+            determined += 1;
+            assert_eq!((steps, model), (7, IntrinsicsModel::FOCAL), "{of}");
+        }
+    }
+    assert!(open > 0 && determined > 0, "{open} open, {determined} determined");
+}
+
 #[test]
 fn a_lens_without_distortion_is_left_without() {
     for seed in 0..10 {
