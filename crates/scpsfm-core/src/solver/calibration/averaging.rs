@@ -47,6 +47,9 @@ impl Choice<'_> {
     /// with distortion once for each kind of lens. An extension that the data can neither confirm nor refute thus costs
     /// what it would move.
     ///
+    /// The value reported is that of the best model's adjustment, not the minimum that its linearisation predicts: what a
+    /// descent along a flat valley still had to go is part of its error.
+    ///
     /// The same models behind lenses of the other projection take part where that was tried, as probable beforehand;
     /// poses and points are taken to be known alike behind either. The terms of distortion are averaged over the models
     /// of the best one's projection: in the other they are those of another series.
@@ -57,7 +60,8 @@ impl Choice<'_> {
         let Selection { best, tried, .. } = selection;
         let views = best.minimum.reconstruction.focals.len();
         let here = best.sigma_log_focal().and_then(|_| best.optimum(best.model, priors));
-        let Some(here) = here else {
+        let own = best.optimum(best.model, &best.priors);
+        let Some((here, own)) = here.zip(own) else {
             let of_group = vec![[None; Parameter::COUNT]; self.problem.groups()];
             return Sigmas { of_group, view_focals: vec![None; views] };
         };
@@ -93,15 +97,18 @@ impl Choice<'_> {
                 let found = (optimum.variance_of(group, parameter), value(from, optimum));
                 is_comparable(from).then_some((weight, found))
             };
-            averaged(&mut weights.iter().zip(&models).filter_map(of_model), value(best, &here)).filter(|_| is_free)
+            // With other priors: as far from their minimum as it is from its own.
+            let reported = value(best, &here) - own.shift_of(group, parameter);
+            averaged(&mut weights.iter().zip(&models).filter_map(of_model), reported).filter(|_| is_free)
         };
         let groups = 0..self.problem.groups();
         let of_group = groups.map(|group| Parameter::ALL.map(|parameter| of_parameter(group, parameter))).collect();
-        let here = best.own_focals(&here);
+        let (here, own) = (best.own_focals(&here), best.own_focals(&own));
         let there: Vec<_> = models.iter().map(|model| model.from.own_focals(&model.optimum)).collect();
         let of_view = |view: usize| {
             let of_models = weights.iter().zip(&there).map(|(&weight, of_views)| (weight, of_views[view]));
-            averaged(&mut { of_models }, here[view].1)
+            let shift = own[view].1 - best.minimum.reconstruction.focals[view].ln();
+            averaged(&mut { of_models }, here[view].1 - shift)
         };
         Sigmas { of_group, view_focals: (0..views).map(of_view).collect() }
     }

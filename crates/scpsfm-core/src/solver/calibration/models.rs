@@ -292,8 +292,9 @@ impl Choice<'_> {
     }
 
     /// Whether the focal length of a group, or of as many views as a calibration takes where each has its own, may be
-    /// determined well enough. The limit is above that of WEAK by `sigma_inflation`: averaging over models may lower
-    /// sigma.
+    /// determined well enough: by its standard deviation, and by how far it still is from the minimum, where a descent
+    /// along a flat valley did not arrive. The limit is above that of WEAK by `sigma_inflation`: averaging over models
+    /// may lower sigma.
     ///
     /// * `fit`: of projective cameras; a lens that does not fit adds to their noise
     pub fn may_be_observable(&self, best: &Candidate, fit: &Fit) -> bool {
@@ -301,14 +302,18 @@ impl Choice<'_> {
         let Some(optimum) = best.optimum(best.model, &best.priors) else { return false };
         let limit = models.sigma_inflation * grades.weak_up_to;
         let noise = best.fit.noise.min(fit.noise);
-        let is_small = |variance: &f64| variance.sqrt() * noise <= limit;
+        let is_determined = |(variance, shift): &(Option<f64>, f64)| {
+            variance.is_some_and(|variance| variance.sqrt() * noise <= limit) && shift.abs() <= limit
+        };
         let focals = &best.minimum.reconstruction.focals;
         if focals.is_empty() {
-            let variance = |group: usize| optimum.variance_of(group, Parameter::LogFocal);
-            return (0..self.problem.groups()).filter_map(variance).any(|variance| is_small(&variance));
+            let focal = Parameter::LogFocal;
+            let of_group = |group: usize| (optimum.variance_of(group, focal), optimum.shift_of(group, focal));
+            return (0..self.problem.groups()).any(|group| is_determined(&of_group(group)));
         }
-        let determined = best.own_focals(&optimum).into_iter().filter_map(|(variance, _)| variance).filter(is_small);
-        determined.count() as f64 >= grades.least_determined * focals.len() as f64
+        let of_views = best.own_focals(&optimum).into_iter().zip(focals);
+        let of_views = of_views.map(|((variance, there), here)| (variance, there - here.ln()));
+        of_views.filter(is_determined).count() as f64 >= grades.least_determined * focals.len() as f64
     }
 
     /// The largest radius at unit depth at which each group observes whose lens is to be replaced; `None` where none is.

@@ -4,6 +4,7 @@ use nalgebra::Vector2;
 
 use super::*;
 use crate::geometry::bundle::metric::Extension;
+use crate::solver::calibration::models::{Candidate, Choice, Selection};
 
 #[test]
 fn a_displaced_principal_point_is_found_and_a_central_one_is_left_alone() {
@@ -189,6 +190,34 @@ fn nothing_else_is_tried_where_the_lens_leaves_the_focal_length_open() {
         }
     }
     assert!(open > 0 && determined > 0, "{open} open, {determined} determined");
+}
+
+/// Poses and points were adjusted to a focal length that is not the best, as where a descent ended on its way.
+#[test]
+fn what_a_descent_still_had_to_go_is_part_of_its_error() {
+    for seed in 0..10 {
+        let scene = testing::scene(seed, 10, 60, 0.001);
+        let points: Vec<Vector4<f64>> = scene.points.iter().map(|point| point.push(1.0)).collect();
+        let cameras = scene.cameras();
+        let problem = of_one_lens(&cameras, &points, &scene.observations, 0.001);
+        let choice = Choice { problem: &problem, scale_px: SIDE_PX, stop: &StopToken::default() };
+        let search = |priors, model, start| choice.search(priors).converged(start, model);
+        let priors = choice.priors(0.001);
+        let converged = search(&priors, IntrinsicsModel::FOCAL, scene.reconstruction()).reconstruction;
+        let fit = Fit::projective(0.0, &problem, scene.points.len(), 0);
+        let at = |factor: f64| {
+            let start = converged.clone().with_scaled_focals(factor);
+            let minimum = search(&priors, IntrinsicsModel::FIXED, start);
+            let best = Candidate::new(minimum, IntrinsicsModel::FOCAL, priors.clone(), &problem);
+            let may_be_observable = choice.may_be_observable(&best, &fit);
+            let sigmas = choice.sigmas(&Selection::of(best), &priors, 1.0);
+            (may_be_observable, sigmas.of_group[0][Parameter::LogFocal as usize].expect("determined"))
+        };
+        let ((_, there), (is_near, near), (is_far, far)) = (at(1.0), at(1.03), at(1.5));
+        println!("seed {seed}: {there:.5}, {near:.5} {is_near}, {far:.5} {is_far}");
+        assert!(there < 0.005 && is_near && !is_far, "seed {seed}");
+        assert!((0.02..0.06).contains(&near), "seed {seed}: {near}");
+    }
 }
 
 #[test]
