@@ -5,7 +5,7 @@
 //! a common misfit that makes their chi-square what it should be (DerSimonian & Laird 1986).
 
 use super::calibration::{GradeOptions, Outcome};
-use crate::domain::{Grade, Warning, WarningCode};
+use crate::domain::{Warning, WarningCode};
 use crate::geometry::statistics::chi_square_quantile;
 
 /// Growth of sigma from which a warning says why, and the sigma from which anyone minds: a quarter of a METRIC one.
@@ -83,16 +83,6 @@ pub fn fuse(estimates: &[Estimate], shared: f64) -> Option<Fused> {
         chi_square: statistic / expected,
         freedom: (estimates.len() - 1) as f64,
     })
-}
-
-/// Raises the sigma of one block's calibration by what the estimates of all blocks have beside their own.
-pub fn admit_misfit(outcome: &mut Outcome, estimates: &[Estimate], grades: &GradeOptions) {
-    let fused = fuse(estimates, 0.0).zip(outcome.sigma_log_focal);
-    let fused = fused.filter(|(fused, _)| outcome.grade != Grade::ProjectiveOnly && fused.differ());
-    if let Some((fused, own)) = fused {
-        let reason = fused.spread(&format!("{} blocks of views", estimates.len()));
-        raise(outcome, own.hypot(fused.misfit), &reason, grades);
-    }
 }
 
 impl Fused {

@@ -82,8 +82,7 @@ pub fn solve(
 ///
 /// AUTO and GEOMETRY judge every observation by itself, but where depths alone verify, and extend a block to every view
 /// that can be registered: all views at once where their tracks are complete and that decides quickly, else few of
-/// them. By PAPER, SCPSFM and PSFM the best block is solved, views outside it are left out with a warning, and blocks
-/// that disagree raise its uncertainty.
+/// them. By PAPER, SCPSFM and PSFM the best block is solved, and views outside it are left out with a warning.
 ///
 /// Tracks that are [duplicates](Duplicates) of another count once, whatever the method.
 ///

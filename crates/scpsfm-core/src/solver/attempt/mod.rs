@@ -1,9 +1,7 @@
 //! One block of views from search to calibration.
 
-mod densest;
 mod options;
 
-pub use densest::solve_densest;
 pub use options::AttemptOptions;
 
 use super::a_contrario::FalseAlarmOptions;
@@ -14,7 +12,6 @@ use super::classification::Judged;
 use super::consensus::{Consensus, LEAST_INLIERS, NoiseOptions};
 use super::depths::{self, DepthOptions, TrackWeights};
 use super::error::Error;
-use super::fusion::Estimate;
 use super::grow;
 use super::learned::TrackScores;
 use super::portfolio::{Effort, Found, Portfolio, VerifiedBy};
@@ -22,7 +19,7 @@ use super::problem::Problem;
 use super::projective::ProjectiveReconstruction;
 use super::recorder::Recorder;
 use super::search::rigid::{LEAST_TRACKS, Rigid};
-use super::{all_tracks, near_duplicates, scpsfm, spread, static_tracks, track_sampling};
+use super::{all_tracks, near_duplicates, scpsfm, spread, static_tracks, track_sampling, view_selection};
 use crate::domain::{FocalPrior, Grade, Method, Stage, WarningCode};
 use crate::geometry::bundle::metric::{Intrinsics, MetricReconstruction};
 use crate::geometry::statistics::median;
@@ -160,14 +157,6 @@ impl Attempt {
         (grade, -calibration.sigma_log_focal.unwrap_or(f64::INFINITY))
     }
 
-    /// The focal length, where it has one that is the same in other blocks: of a zoom, other views have others.
-    pub fn estimate(&self) -> Option<Estimate> {
-        let calibration = self.calibration.as_ref().filter(|_| self.is_calibrated())?;
-        let focal = calibration.intrinsics().filter(|_| calibration.focals.is_none())?.focal;
-        let sigma = calibration.sigma_log_focal?;
-        (focal > 0.0).then(|| Estimate { log_focal: focal.ln(), sigma })
-    }
-
     /// Whether there is a metric reconstruction, whatever it is worth.
     pub fn has_metric(&self) -> bool {
         self.calibration.as_ref().is_some_and(|calibration| calibration.metric.is_some())
@@ -231,6 +220,25 @@ pub fn solve_block(
     let mut attempt = search_block(problem, block, effort, recorder)?;
     calibrate(problem, &mut attempt, priors, recorder)?;
     Ok(attempt)
+}
+
+/// Solves the densest blocks of views, one after the other until one is METRIC; the best of them. Other views are left
+/// out.
+pub fn solve_densest(problem: &Problem, recorder: &mut Recorder) -> Result<Option<Attempt>, Error> {
+    let candidates = view_selection::candidate_views(problem);
+    let mut best: Option<Attempt> = None;
+    for (k, views) in candidates.iter().enumerate() {
+        problem.stopped()?;
+        recorder.begin_block(k, candidates.len());
+        let attempt = solve_block(problem, problem.block(views), Effort::default(), &[], recorder)?;
+        if best.as_ref().is_none_or(|best| attempt.merit() > best.merit()) {
+            best = Some(attempt);
+        }
+        if best.as_ref().is_some_and(Attempt::is_good) {
+            break;
+        }
+    }
+    Ok(best)
 }
 
 /// Searches a block, or as many of its tracks as its method can afford, for a consensus.
