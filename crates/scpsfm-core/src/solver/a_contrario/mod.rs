@@ -21,7 +21,7 @@ use crate::domain::StopToken;
 use crate::geometry::measurement::CompleteBlock;
 use crate::geometry::statistics::{chi_square_gate, ln_choose};
 use crate::geometry::triangulation;
-use random::{RandomTracks, Tail, constraints_of_track, gate};
+use random::{Tail, constraints_of_track, gate};
 
 const OPTIONS: FalseAlarmOptions = FalseAlarmOptions::DEFAULT;
 
@@ -47,7 +47,7 @@ pub fn ln_false_alarms(block: &CompleteBlock, consensus: &Consensus, spread: f64
 /// `C(m, k) C(k, 7) a^(k - 7)`
 ///
 /// `a` is the probability to be admitted at most, and less where the gate is so wide that it tells nothing: see
-/// [`RandomTracks::ln_as_good`].
+/// [`random::ln_as_good`].
 ///
 /// * `inliers`: that differ, see [`Consensus::distinct_count`]
 fn by_cameras(block: &CompleteBlock, consensus: &Consensus, inliers: usize, spread: f64, stop: &StopToken) -> f64 {
@@ -66,12 +66,11 @@ fn by_cameras(block: &CompleteBlock, consensus: &Consensus, inliers: usize, spre
     if at_most < OPTIONS.ln_by_cameras {
         return at_most;
     }
-    let mut random = RandomTracks::new(block, consensus, spread);
-    // To stop is to accept nothing.
-    if !random.try_until(OPTIONS.random_tracks, stop) {
-        return f64::INFINITY;
+    match random::residuals(block, consensus, stop) {
+        Some(squared) => at(random::ln_as_good(block, consensus, &squared, variance)),
+        // To stop is to accept nothing.
+        None => f64::INFINITY,
     }
-    at(random.ln_as_good())
 }
 
 /// Natural logarithm of the number of false alarms by residuals, `m C(m, k) p`: the sizes and sets of inliers, times
@@ -183,9 +182,8 @@ mod tests {
                     let Some(start) = affine::seed(&complete, (0..12).collect()) else { continue };
                     let grown = grow::grow(&complete, start, noise, &stop);
                     let Some(consensus) = grown else { continue };
-                    let mut random = RandomTracks::new(&complete, &consensus, spread);
-                    assert!(random.try_until(OPTIONS.random_tracks, &stop));
-                    let share = random.measured() / (constraints_of_track(&complete) * spread * spread);
+                    let squared = random::residuals(&complete, &consensus, &stop).expect("not stopped");
+                    let share = random::measured(&squared) / (constraints_of_track(&complete) * spread * spread);
                     assert!(share > OPTIONS.least_measured, "{views} views, seed {seed}, outliers {outliers}: {share}");
                     (tried, least) = (tried + 1, share.min(least));
                 }

@@ -54,59 +54,42 @@ impl Tail {
     }
 }
 
-/// Tracks without structure, as the cameras of a consensus see them: their coordinates are independent and distributed
-/// like those of the block, view by view.
-pub struct RandomTracks<'a> {
-    block: &'a CompleteBlock,
-    consensus: &'a Consensus,
-    /// Variance of the image points.
-    variance: f64,
-    rng: ChaCha8Rng,
-    /// Squared residuals, ascending.
-    squared: Vec<f64>,
+/// Squared residuals, ascending, that tracks without structure leave to the cameras of a consensus: their coordinates
+/// are independent and distributed like those of the block, view by view. `None` once it is to stop.
+pub fn residuals(block: &CompleteBlock, consensus: &Consensus, stop: &StopToken) -> Option<Vec<f64>> {
+    let mut rng = ChaCha8Rng::seed_from_u64(SEED);
+    let mut squared: Vec<f64> = Vec::with_capacity(OPTIONS.random_tracks);
+    while squared.len() < OPTIONS.random_tracks {
+        if stop.is_stopped() {
+            return None;
+        }
+        let some = LANES.min(OPTIONS.random_tracks - squared.len());
+        let drawn: Vec<_> = (0..some).map(|_| random_track(block, &mut rng)).collect();
+        let drawn: Vec<&[Observation]> = drawn.iter().map(Vec::as_slice).collect();
+        let batch = Batch::new(&consensus.cameras, &drawn);
+        let found = batch.refine(batch.linear(), |_| true, consensus::ConsensusOptions::DEFAULT.point_steps);
+        let finite = |cost: f64| if cost.is_finite() { cost } else { f64::MAX };
+        squared.extend((0..batch.tracks()).map(|track| finite(found.cost(track))));
+    }
+    squared.sort_by(f64::total_cmp);
+    Some(squared)
 }
 
-impl<'a> RandomTracks<'a> {
-    /// * `spread`: standard deviation of the image points
-    pub fn new(block: &'a CompleteBlock, consensus: &'a Consensus, spread: f64) -> Self {
-        let rng = ChaCha8Rng::seed_from_u64(SEED);
-        Self { block, consensus, variance: spread * spread, rng, squared: Vec::new() }
-    }
+/// The residual that [`measured_share`](super::FalseAlarmOptions::measured_share) of these [`residuals`] have at most.
+pub fn measured(squared: &[f64]) -> f64 {
+    squared[(OPTIONS.measured_share * squared.len() as f64) as usize]
+}
 
-    /// Tries so many in all; `false` once it is to stop.
-    pub fn try_until(&mut self, tracks: usize, stop: &StopToken) -> bool {
-        let Self { block, consensus: Consensus { cameras, .. }, rng, squared, .. } = self;
-        while squared.len() < tracks {
-            if stop.is_stopped() {
-                return false;
-            }
-            let some = LANES.min(tracks - squared.len());
-            let drawn: Vec<_> = (0..some).map(|_| random_track(block, rng)).collect();
-            let drawn: Vec<&[Observation]> = drawn.iter().map(Vec::as_slice).collect();
-            let batch = Batch::new(cameras, &drawn);
-            let found = batch.refine(batch.linear(), |_| true, consensus::ConsensusOptions::DEFAULT.point_steps);
-            let finite = |cost: f64| if cost.is_finite() { cost } else { f64::MAX };
-            squared.extend((0..batch.tracks()).map(|track| finite(found.cost(track))));
-        }
-        squared.sort_by(f64::total_cmp);
-        true
-    }
-
-    /// The residual that [`measured_share`](super::FalseAlarmOptions::measured_share) of those that were tried have at
-    /// most.
-    pub fn measured(&self) -> f64 {
-        self.squared[(OPTIONS.measured_share * self.squared.len() as f64) as usize]
-    }
-
-    /// Natural logarithm of the probability `a` of which `a^n` bounds that `n` of them are all admitted and leave no
-    /// more on average than the inliers of the consensus do: see [`ln_as_small`].
-    pub fn ln_as_good(&self) -> f64 {
-        let constraints = constraints_of_track(self.block);
-        let tail = Tail { constraints, variance: self.variance, measured: self.measured() };
-        // By the constraints of all inliers together: what they leave once the cameras are not fitted to them.
-        let mean = self.consensus.rms().map_or(f64::INFINITY, |rms| rms * rms * tail.constraints);
-        ln_as_small(&self.squared, &tail, gate(self.block, self.consensus), mean)
-    }
+/// Natural logarithm of the probability `a` of which `a^n` bounds that `n` tracks without structure are all admitted and
+/// leave no more on average than the inliers of the consensus do: see [`ln_as_small`].
+///
+/// * `squared`: as of [`residuals`]
+/// * `variance`: of the image points
+pub fn ln_as_good(block: &CompleteBlock, consensus: &Consensus, squared: &[f64], variance: f64) -> f64 {
+    let tail = Tail { constraints: constraints_of_track(block), variance, measured: measured(squared) };
+    // By the constraints of all inliers together: what they leave once the cameras are not fitted to them.
+    let mean = consensus.rms().map_or(f64::INFINITY, |rms| rms * rms * tail.constraints);
+    ln_as_small(squared, &tail, gate(block, consensus), mean)
 }
 
 /// A point of each view, of as many tracks as there are: points of one track have structure.
