@@ -185,7 +185,6 @@ impl Reconstruction {
             point: place(&split.point, split.track, &split.retained),
         };
         let splits = judged.splits.iter().map(split).collect();
-        let two_view_points = classification::two_view_points(problem, &self.geometry, judged.noise);
         let two_view_track = |found: &classification::TwoViewPoint| TwoViewTrack {
             track: found.track as u32,
             weight: found.weight as f32,
@@ -195,7 +194,7 @@ impl Reconstruction {
         // What depths or a method of its own make an inlier needs no other verdict.
         let is_told =
             |found: &&classification::TwoViewPoint| !judged.tracks.inlier[found.track] && self.holds(&found.retained);
-        let two_view_tracks = two_view_points.iter().filter(is_told).map(two_view_track).collect();
+        let two_view_tracks = judged.two_view_points.iter().filter(is_told).map(two_view_track).collect();
         if self.geometry.component_of_view.iter().any(|&component| component > 0) {
             let of_point = |(point, component): (&Option<_>, &u32)| point.map_or(0, |_: [f64; 3]| *component);
             judged.tracks.part = points.iter().zip(&self.geometry.component_of_track).map(of_point).collect();

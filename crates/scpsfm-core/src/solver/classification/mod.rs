@@ -9,8 +9,6 @@ mod track_classifier;
 
 pub use options::ClassificationOptions;
 
-use std::ops::Range;
-
 use crate::domain::result::{ObservationResults, TrackResults};
 use crate::domain::{Input, LeftOut};
 use crate::geometry::bundle::metric::Intrinsics;
@@ -22,7 +20,7 @@ use crate::solver::consensus::LEAST_VIEWS;
 use crate::solver::noise_model::NoiseModel;
 use crate::solver::per_track::{BATCH, TRACKS_A_RUN, WORTH_A_THREAD};
 use crate::solver::problem::{LEAST_RETAINED_SHARE, Problem};
-use track_classifier::{Finding, TrackClassifier};
+use track_classifier::TrackClassifier;
 
 const OPTIONS: ClassificationOptions = ClassificationOptions::DEFAULT;
 
@@ -59,12 +57,6 @@ impl Geometry {
         problem.of_track(track).filter(|&k| is_seen(problem.view_of(k))).collect()
     }
 
-    /// Those of some tracks that are of the scene, each with its observations in registered views of its component.
-    fn judgeable(&self, problem: &Problem, tracks: Range<usize>) -> impl Iterator<Item = (usize, Vec<usize>)> {
-        let is_of_scene = |&track: &usize| self.of_static || !problem.is_static[track];
-        tracks.filter(is_of_scene).map(|track| (track, self.of_track(problem, track)))
-    }
-
     /// These observations where pinholes would see them.
     fn observations(&self, problem: &Problem, seen: &[usize]) -> Vec<Observation> {
         seen.iter().map(|&k| self.observation(problem, k)).collect()
@@ -97,6 +89,8 @@ pub struct Judged {
     pub points: Vec<Option<Point>>,
     /// The other points that linked tracks join, by track.
     pub splits: Vec<SplitPoint>,
+    /// The points of tracks that two registered views of one component see, by track.
+    pub two_view_points: Vec<TwoViewPoint>,
     /// The noise that everything was judged by.
     pub noise: NoiseModel,
 }
@@ -112,8 +106,9 @@ pub struct SplitPoint {
     pub retained: Vec<Observation>,
 }
 
-/// The point of a track that two registered views see and whose observations agree with their cameras: it may be right,
-/// and nothing verifies it.
+/// The point of a track that two registered views see and that is more likely right than wrong. Two observations fit a
+/// point in three of their four coordinates, so that a wrong track agrees where it is within the noise of the epipolar
+/// line by chance: this verifies nothing.
 pub struct TwoViewPoint {
     pub track: usize,
     /// Probability that it is right.
@@ -124,7 +119,7 @@ pub struct TwoViewPoint {
 }
 
 /// Judges every track that has three observations in registered views or more; the others, and static ones that the
-/// geometry is not of, have weight 0 and no residuals.
+/// geometry is not of, have weight 0 and no residuals. Of those with two it says where their points are.
 ///
 /// Twice: with a wide tail first, then with the tail that the tracks show which are right in all their observations.
 /// Where there is none, a wrong observation is told from a right one nearer by: at 8 to 9 core deviations instead of 12
@@ -156,55 +151,23 @@ fn whole_tracks(problem: &Problem, geometry: &Geometry, judged: &Judged) -> Vec<
 }
 
 fn judge_under(problem: &Problem, geometry: &Geometry, noise: NoiseModel, progress: &mut dyn FnMut(usize)) -> Judged {
-    let mut judged = Judged::nothing(problem.input, noise);
-    let mut write = |classifier: &TrackClassifier, finding: Finding| classifier.write(&mut judged, &finding);
-    of_each_track(problem, geometry, noise, |classifier, tracks| classifier.find(tracks), &mut write, progress);
-    judged
-}
-
-/// The points of the tracks that two registered views of one component see and that are more likely right than wrong,
-/// in front of both where these are metric.
-///
-/// Two observations fit a point in three of their four coordinates, so that a wrong track is consistent where it is
-/// within the noise of the epipolar line by chance: this verifies nothing.
-pub fn two_view_points(problem: &Problem, geometry: &Geometry, noise: NoiseModel) -> Vec<TwoViewPoint> {
-    let mut points = Vec::new();
-    let mut take = |_: &TrackClassifier, point| points.push(point);
-    of_each_track(
-        problem,
-        geometry,
-        noise,
-        |classifier, tracks| classifier.find_two_view_points(tracks),
-        &mut take,
-        &mut |_| (),
-    );
-    points
-}
-
-/// Calls `find` with the tracks batch by batch, and `take` with each of its findings, in the order of the tracks.
-fn of_each_track<T: Send>(
-    problem: &Problem,
-    geometry: &Geometry,
-    noise: NoiseModel,
-    find: impl Fn(&TrackClassifier, Range<usize>) -> Vec<T> + Sync,
-    take: &mut dyn FnMut(&TrackClassifier, T),
-    progress: &mut dyn FnMut(usize),
-) {
     let cameras = robust_triangulation::or_zeros(&geometry.cameras);
     let triangulator = Triangulator::new(&cameras);
     let least_share = geometry.least_share(problem);
     let classifier = TrackClassifier { problem, cameras: &cameras, triangulator, geometry, least_share, noise };
+    let mut judged = Judged::nothing(problem.input, noise);
     let threads = problem.threads.if_worth(problem.tracks() >= WORTH_A_THREAD);
     for first in (0..problem.tracks()).step_by(BATCH) {
         let last = problem.tracks().min(first + BATCH);
         let side_by_side = |k: usize| match problem.stop.is_stopped() {
             true => Vec::new(),
-            false => find(&classifier, first + k * LANES..last.min(first + (k + 1) * LANES)),
+            false => classifier.find(first + k * LANES..last.min(first + (k + 1) * LANES)),
         };
         let mut progress = |batches| progress(first + batches * LANES);
         let found = threads.map((last - first).div_ceil(LANES), TRACKS_A_RUN / LANES, side_by_side, &mut progress);
-        found.into_iter().flatten().for_each(|found| take(&classifier, found));
+        found.iter().flatten().for_each(|finding| classifier.write(&mut judged, finding));
     }
+    judged
 }
 
 impl Judged {
@@ -240,6 +203,7 @@ impl Judged {
             retained: vec![Vec::new(); count],
             points: vec![None; count],
             splits: Vec::new(),
+            two_view_points: Vec::new(),
             noise,
         }
     }

@@ -51,11 +51,14 @@ pub struct TrackClassifier<'a> {
 
 impl TrackClassifier<'_> {
     /// Judges some tracks, no more than a [`Batch`] takes, and, of those that are right and may hold wrong
-    /// observations, what they leave; without those that too few views see.
+    /// observations, what they leave; without those that are not of the scene, or that one view sees.
     pub fn find(&self, tracks: Range<usize>) -> Vec<Finding> {
         let Self { problem, geometry, .. } = self;
-        let (tracks, seen): (Vec<usize>, Vec<Vec<usize>>) =
-            geometry.judgeable(problem, tracks).filter(|(_, seen)| seen.len() >= VERIFIED).unzip();
+        let (tracks, seen): (Vec<usize>, Vec<Vec<usize>>) = tracks
+            .filter(|&track| geometry.of_static || !problem.is_static[track])
+            .map(|track| (track, geometry.of_track(problem, track)))
+            .filter(|(_, seen)| seen.len() >= 2)
+            .unzip();
         let observations: Vec<Vec<Observation>> =
             seen.iter().map(|seen| geometry.observations(problem, seen)).collect();
         let verdicts = self.judge(&observations.iter().map(Vec::as_slice).collect::<Vec<_>>());
@@ -70,27 +73,6 @@ impl TrackClassifier<'_> {
                 Finding { track, observations, places, verdict, others }
             })
             .collect()
-    }
-
-    /// The points of the tracks of two observations, of no more than a [`Batch`] takes, that are more likely right than
-    /// wrong.
-    pub fn find_two_view_points(&self, tracks: Range<usize>) -> Vec<TwoViewPoint> {
-        let Self { problem, geometry, .. } = self;
-        let (tracks, observations): (Vec<usize>, Vec<Vec<Observation>>) = geometry
-            .judgeable(problem, tracks)
-            .filter(|(_, seen)| seen.len() == 2)
-            .map(|(track, seen)| (track, geometry.observations(problem, &seen)))
-            .unzip();
-        if tracks.is_empty() {
-            return Vec::new();
-        }
-        let batch = Batch::new(self.cameras, &observations.iter().map(Vec::as_slice).collect::<Vec<_>>());
-        let found = batch.refine(batch.linear(), |_| true, OPTIONS.point_steps);
-        let points = tracks.into_iter().zip(observations).enumerate().map(|(lane, (track, observations))| {
-            let (weight, point) = self.probability(&observations, &[0, 1], found.point(lane), found.cost(lane));
-            TwoViewPoint { track, weight, point, retained: observations }
-        });
-        points.filter(|found| found.weight > 0.5).collect()
     }
 
     /// Drops the worst observation of each track as long as it is more likely wrong than right, then weighs what
@@ -142,9 +124,10 @@ impl TrackClassifier<'_> {
         tracks.iter().zip(retained).enumerate().map(verdict).collect()
     }
 
-    /// Observations that a track must retain.
+    /// Observations that a track must retain; of one that two views see, both.
     fn least_retained(&self, observations: &[Observation]) -> usize {
-        VERIFIED.max((self.least_share * observations.len() as f64).ceil() as usize)
+        let count = observations.len();
+        VERIFIED.max((self.least_share * count as f64).ceil() as usize).min(count)
     }
 
     /// Probability that the track of a point is right by the observations that it retains, and the point, at infinity
@@ -232,6 +215,12 @@ impl TrackClassifier<'_> {
     pub fn write(&self, judged: &mut Judged, finding: &Finding) {
         let Finding { track, observations, places, verdict, others } = finding;
         let track = *track;
+        if observations.len() < VERIFIED {
+            let TrackVerdict { weight, point, .. } = *verdict;
+            let found = TwoViewPoint { track, weight, point, retained: observations.clone() };
+            judged.two_view_points.extend(Some(found).filter(|_| weight > 0.5));
+            return;
+        }
         judged.tracks.weight[track] = verdict.weight as f32;
         judged.tracks.inlier[track] = verdict.inlier;
         for ((&place, observation), &retained) in places.iter().zip(observations).zip(&verdict.retained) {
