@@ -452,9 +452,12 @@ fn calibrate_projective(
         focal_per_view: problem.has_own_focals(),
         group_of: &group_of,
         focal_priors: &focal_priors,
+        scale_px: problem.scale_px,
         options: &problem.calibration_options,
+        stop: problem.stop,
+        heartbeat: &|| (),
     };
-    let mut outcomes = calibration::calibrate(&to_calibrate, problem.scale_px, problem.stop)?;
+    let mut outcomes = calibration::calibrate(&to_calibrate)?;
     if let Some(undone) = &problem.undone {
         for metric in outcomes.iter_mut().filter_map(|outcome| outcome.metric.as_mut()) {
             for (lens, &camera) in metric.intrinsics.iter_mut().zip(&cameras) {

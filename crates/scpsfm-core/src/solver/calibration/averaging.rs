@@ -1,6 +1,7 @@
 //! What not knowing the model costs: standard deviations averaged over models.
 
-use super::models::{Candidate, Choice, Selection};
+use super::Uncalibrated;
+use super::models::{Candidate, Selection};
 use crate::domain::FocalPrior;
 use crate::geometry::bundle::metric::{Extension, IntrinsicsModel, IntrinsicsPrior, Optimum, Parameter};
 
@@ -38,7 +39,7 @@ impl Sigmas {
     }
 }
 
-impl Choice<'_> {
+impl Uncalibrated<'_> {
     /// Standard deviations under the best model and all doubt about it.
     ///
     /// Bayesian model averaging (Hoeting, Madigan, Raftery & Volinsky 1999, eq. 3) over all combinations of extensions:
@@ -56,13 +57,13 @@ impl Choice<'_> {
     ///
     /// * `priors`: those of the best model, or without what is known of a focal length
     /// * `inflation`: factor on all of them, for what a linearisation with independent noise does not see
-    pub fn sigmas(&self, selection: &Selection, priors: &[IntrinsicsPrior], inflation: f64) -> Sigmas {
+    pub(super) fn sigmas(&self, selection: &Selection, priors: &[IntrinsicsPrior], inflation: f64) -> Sigmas {
         let Selection { best, tried, .. } = selection;
         let views = best.minimum.reconstruction.focals.len();
         let here = best.sigma_log_focal().and_then(|_| best.optimum(best.model, priors));
         let own = best.optimum(best.model, &best.priors);
         let Some((here, own)) = here.zip(own) else {
-            let of_group = vec![[None; Parameter::COUNT]; self.problem.groups()];
+            let of_group = vec![[None; Parameter::COUNT]; self.groups()];
             return Sigmas { of_group, view_focals: vec![None; views] };
         };
         let unit = best.fit.noise.powi(2);
@@ -85,7 +86,7 @@ impl Choice<'_> {
                 }
             }
             let sigma = (squared / total).sqrt() * inflation;
-            Some(sigma).filter(|sigma| sigma.is_finite() && unknown <= self.problem.options.models.negligible * total)
+            Some(sigma).filter(|sigma| sigma.is_finite() && unknown <= self.options.models.negligible * total)
         };
         let free = best.model.parameters();
         let of_parameter = |group: usize, parameter: Parameter| {
@@ -101,7 +102,7 @@ impl Choice<'_> {
             let reported = value(best, &here) - own.shift_of(group, parameter);
             averaged(&mut weights.iter().zip(&models).filter_map(of_model), reported).filter(|_| is_free)
         };
-        let groups = 0..self.problem.groups();
+        let groups = 0..self.groups();
         let of_group = groups.map(|group| Parameter::ALL.map(|parameter| of_parameter(group, parameter))).collect();
         let (here, own) = (best.own_focals(&here), best.own_focals(&own));
         let there: Vec<_> = models.iter().map(|model| model.from.own_focals(&model.optimum)).collect();
@@ -131,7 +132,7 @@ impl Choice<'_> {
             extensions.filter(|one| candidate.model.contains(*one) != model.contains(*one)).count()
         };
         // A richer model may have ended in another minimum, behind the cameras.
-        let least = self.problem.options.grades.least_in_front.min(best.minimum.cheirality);
+        let least = self.options.grades.least_in_front.min(best.minimum.cheirality);
         let is_like = |tried: &&Candidate| {
             let stands = tried.information.is_some() && tried.minimum.cheirality >= least;
             stands && tried.has_projections_of(like)
@@ -146,13 +147,13 @@ impl Choice<'_> {
             let log_weight = share.ln() + self.log_prior(model, &priors) + 0.5 * gain - 0.5 * optimum.log_determinant;
             Some(Weighed { log_weight, from, optimum })
         };
-        self.problem.options.lenses.kinds(model).into_iter().filter_map(of_kind).collect()
+        self.options.lenses.kinds(model).into_iter().filter_map(of_kind).collect()
     }
 
     /// Logarithm of the prior probability of a model and of the density of its parameters where they are most likely,
     /// up to what all models share.
     fn log_prior(&self, model: IntrinsicsModel, priors: &[IntrinsicsPrior]) -> f64 {
-        let lenses = &self.problem.options.lenses;
+        let lenses = &self.options.lenses;
         let of = |extension: Extension| match model.contains(extension) {
             true => {
                 let of_group = |prior: &IntrinsicsPrior| -> f64 {

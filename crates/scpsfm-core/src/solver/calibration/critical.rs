@@ -7,9 +7,8 @@ use nalgebra::{Matrix3, Vector3};
 use super::Uncalibrated;
 use super::fit::Fit;
 use super::misfit;
-use super::models::Choice;
 use super::options::{CalibrationOptions, CriticalOptions};
-use crate::domain::{StopToken, VERIFIED, Warning, WarningCode};
+use crate::domain::{VERIFIED, Warning, WarningCode};
 use crate::geometry::bundle::critical::{Homographies, Translating};
 use crate::geometry::bundle::metric::{Extension, IntrinsicsModel, IntrinsicsPrior, MetricReconstruction};
 use crate::geometry::bundle::projective;
@@ -50,12 +49,12 @@ pub(super) enum Upgrade {
 /// Behind homographies the fourth columns of the cameras and the depths of the points are free, and fit some of what is
 /// wrong: a track that slid along the epipolar lines of a view, or jumped. The evidence asks whether it is more than as
 /// many unknowns would fit by chance.
-pub(super) fn without_unsupported(problem: &Uncalibrated, stop: &StopToken) -> Option<Vec<Observation>> {
+pub(super) fn without_unsupported(problem: &Uncalibrated) -> Option<Vec<Observation>> {
     let Uncalibrated { observations, noise, outlier_density, .. } = *problem;
     let (views, points) = (problem.cameras.len(), problem.points.len());
     homography::median_residual(observations, views, noise, problem.options.critical.lens_limit)?;
     let start = ReferenceHomographies::new(observations, views, points, noise)?;
-    let squared = start.squared_residuals(observations, noise, stop);
+    let squared = start.squared_residuals(observations, noise, problem.stop);
     let noise_of_homographies = core_noise(squared.iter().map(|squared| squared.sqrt()).collect(), start.unknowns())?;
     let limit = CHI_SQUARE_OF_TWO * noise_of_homographies.powi(2);
     let mut explained = vec![0; points];
@@ -84,16 +83,15 @@ pub(super) fn without_unsupported(problem: &Uncalibrated, stop: &StopToken) -> O
 /// What kind of motion and scene the views of this consensus show.
 ///
 /// * `fit`: the projective cameras that every model is tested against
-pub(super) fn find(choice: &Choice, fit: &Fit) -> Critical {
-    let Choice { problem, stop, .. } = *choice;
-    let (observations, views) = (problem.observations, problem.cameras.len());
-    let points = problem.points.len();
+pub(super) fn find(problem: &Uncalibrated, fit: &Fit) -> Critical {
+    let Uncalibrated { observations, stop, .. } = *problem;
+    let (views, points) = (problem.cameras.len(), problem.points.len());
     let CalibrationOptions { critical: options, fit: fit_options, .. } = problem.options;
     let translation = critical::fit_translation(observations, views, points, fit.noise, options.epipolar_limit, stop)
         .filter(|found| !fit.refutes(&Fit::new(found.cost, found.unknowns, problem), fit_options));
     let mut plane = None;
     if let Some(residual) = homography::median_residual(observations, views, fit.noise, options.lens_limit) {
-        match without_parallax(choice, fit, residual, translation.is_some()) {
+        match without_parallax(problem, fit, residual, translation.is_some()) {
             ControlFlow::Break(found) => return found,
             ControlFlow::Continue(homographies) => plane = homographies,
         }
@@ -121,21 +119,20 @@ fn undecided(detail: String, reason: &str) -> Critical {
 /// * `residual`: by how much homographies miss, see [`homography::median_residual`]
 /// * `translates`: whether a camera that does not turn explains the views
 fn without_parallax(
-    choice: &Choice,
+    problem: &Uncalibrated,
     fit: &Fit,
     residual: f64,
     translates: bool,
 ) -> ControlFlow<Critical, Option<Homographies>> {
-    let Choice { problem, scale_px, stop } = *choice;
     let CalibrationOptions { critical: options, fit: fit_options, .. } = problem.options;
     let is_flat = residual < options.homography_limit;
     let missed = format!(
         "homographies between the views miss by a median of {residual:.1} standard deviations of the noise ({:.2} px)",
-        fit.noise * scale_px
+        fit.noise * problem.scale_px
     );
-    let Uncalibrated { observations, group_of, focal_per_view, .. } = *problem;
+    let Uncalibrated { observations, group_of, focal_per_view, stop, .. } = *problem;
     let (views, points) = (problem.cameras.len(), problem.points.len());
-    let priors = choice.priors(fit.noise);
+    let priors = problem.priors(fit.noise);
     let fits = || {
         let plane = ReferenceHomographies::new(observations, views, points, fit.noise)?;
         let start = critical::rotation_start(observations, views, points, fit.noise)?;
@@ -160,13 +157,13 @@ fn without_parallax(
     // Of few views it may have more unknowns than what it is tested against, and neither shows parallax behind a lens:
     // projective cameras do, once that is undone.
     let turns = by_rotation.freedom > free.freedom && deviations < fit_options.misfit_deviations && {
-        let by_views = misfit::projective_without_lens(&rotation.model, problem, stop);
+        let by_views = misfit::projective_without_lens(&rotation.model, problem);
         by_views.parallax_deviations(&by_rotation, problem) < options.plane_deviations
     };
     if !turns && (!is_flat || translates && has_depth) {
         return ControlFlow::Continue(Some(plane.model));
     }
-    if !turns && !translates && !has_depth && !focal_per_view && turns_and_zooms(choice, &start, &by_plane, &priors) {
+    if !turns && !translates && !has_depth && !focal_per_view && turns_and_zooms(problem, &start, &by_plane, &priors) {
         let detail = format!("{missed}: a camera that turns and zooms explains the views as well as they do");
         let reason = "a camera that turned and zoomed has other focal lengths than one that moved before a plane: solve \
                       with a focal length a view (focal_per_view) if it zoomed";
@@ -209,12 +206,16 @@ fn without_parallax(
 }
 
 /// Whether a camera that only turns, with a focal length of each view, fits as well as homographies.
-fn turns_and_zooms(choice: &Choice, start: &MetricReconstruction, by_plane: &Fit, priors: &[IntrinsicsPrior]) -> bool {
-    let Choice { problem, stop, .. } = *choice;
+fn turns_and_zooms(
+    problem: &Uncalibrated,
+    start: &MetricReconstruction,
+    by_plane: &Fit,
+    priors: &[IntrinsicsPrior],
+) -> bool {
     // What a lens adds to these would explain a plane too.
     let model = IntrinsicsModel::FOCAL_PER_VIEW.with(Extension::PrincipalPoint);
     let of_one = vec![0; problem.cameras.len()];
-    let found = critical::fit_rotation(start, problem.observations, &of_one, model, &priors[..1], stop);
+    let found = critical::fit_rotation(start, problem.observations, &of_one, model, &priors[..1], problem.stop);
     found.is_some_and(|found| {
         let fit = Fit::new(found.cost, found.unknowns, problem);
         fit.freedom > by_plane.freedom && !by_plane.refutes(&fit, &problem.options.fit)

@@ -4,9 +4,8 @@ use nalgebra::Vector4;
 
 use super::Uncalibrated;
 use super::fit::Fit;
-use super::models::{Candidate, Choice};
+use super::models::Candidate;
 use super::options::FitOptions;
-use crate::domain::StopToken;
 use crate::geometry::bundle::metric::{Extension, Intrinsics, IntrinsicsPrior, MetricReconstruction};
 use crate::geometry::bundle::sequence;
 use crate::geometry::bundle::{Options, projective};
@@ -57,9 +56,9 @@ impl Comparison {
     }
 
     /// * `fit`: of the projective reconstruction
-    pub fn new(best: &Candidate, fit: &Fit, choice: &Choice) -> Self {
-        let (projective, metric) = undistorted_fits(best, choice).unwrap_or((*fit, best.fit));
-        let options = &choice.problem.options.fit;
+    pub fn new(best: &Candidate, fit: &Fit, problem: &Uncalibrated) -> Self {
+        let (projective, metric) = undistorted_fits(best, problem).unwrap_or((*fit, best.fit));
+        let options = &problem.options.fit;
         let root = projective.statistic(metric.cost, metric.freedom).max(1.0).sqrt();
         Self {
             ratio: options.posterior_noise(best.fit.cost, best.fit.freedom) / fit.noise,
@@ -72,14 +71,14 @@ impl Comparison {
 
 /// The fits of projective cameras and of a calibration without its lens to the points of the undistorted images: no
 /// projective camera has a lens, and would fit worse for it. `None` of a calibration without one.
-fn undistorted_fits(best: &Candidate, choice: &Choice) -> Option<(Fit, Fit)> {
+fn undistorted_fits(best: &Candidate, problem: &Uncalibrated) -> Option<(Fit, Fit)> {
     let of_lens = best.model.extensions().filter(|extension| extension.is_of_lens());
-    let terms = choice.problem.groups() * of_lens.map(|extension| extension.parameters().len()).sum::<usize>();
+    let terms = problem.groups() * of_lens.map(|extension| extension.parameters().len()).sum::<usize>();
     if !best.minimum.reconstruction.intrinsics.iter().any(Intrinsics::distorts) {
         return None;
     }
-    let observations = undistorted(&best.minimum.reconstruction, choice.problem.observations);
-    let problem = &Uncalibrated { observations: &observations, ..*choice.problem };
+    let observations = undistorted(&best.minimum.reconstruction, problem.observations);
+    let problem = &Uncalibrated { observations: &observations, ..*problem };
     let options = Options::squared(problem.options.fit.undistorted_iterations);
 
     let mut pinhole = best.minimum.reconstruction.clone();
@@ -88,29 +87,29 @@ fn undistorted_fits(best: &Candidate, choice: &Choice) -> Option<(Fit, Fit)> {
         true => {
             let (start, iterations) = (critical::homographies_of(&pinhole)?, options.max_iterations);
             let observed = problem.observed_points();
-            let found = critical::fit_homographies(start, observed, &observations, iterations, choice.stop);
+            let found = critical::fit_homographies(start, observed, &observations, iterations, problem.stop);
             Fit::new(found.cost, found.unknowns + terms, problem)
         }
         false => {
             let points: Vec<Vector4<f64>> = pinhole.points.iter().map(|point| point.push(1.0)).collect();
-            projective_fit(&pinhole.cameras(), &points, terms, problem, &options, choice.stop)
+            projective_fit(&pinhole.cameras(), &points, terms, problem, &options)
         }
     };
 
     let model = best.model.without_lens();
-    let report = sequence::adjust_all(&mut pinhole, &observations, model, &best.priors, &options, choice.stop);
+    let report = sequence::adjust_all(&mut pinhole, &observations, model, &best.priors, &options, problem.stop);
     let of_priors = IntrinsicsPrior::cost_of(&best.priors, model, &pinhole.intrinsics);
     Some((projective, Fit::metric(report.cost - of_priors, &pinhole, best.model, problem)))
 }
 
 /// The fit of projective cameras to the points of the images without the lens that this reconstruction has.
-pub(super) fn projective_without_lens(metric: &MetricReconstruction, problem: &Uncalibrated, stop: &StopToken) -> Fit {
+pub(super) fn projective_without_lens(metric: &MetricReconstruction, problem: &Uncalibrated) -> Fit {
     let observations = undistorted(metric, problem.observations);
     let problem = &Uncalibrated { observations: &observations, ..*problem };
     let of_lens = Extension::ALL.into_iter().filter(|extension| extension.is_of_lens());
     let terms = problem.groups() * of_lens.map(|extension| extension.parameters().len()).sum::<usize>();
     let options = Options::squared(problem.options.critical.parallax_iterations);
-    projective_fit(problem.cameras, problem.points, terms, problem, &options, stop)
+    projective_fit(problem.cameras, problem.points, terms, problem, &options)
 }
 
 /// The fit of projective cameras from here.
@@ -122,10 +121,9 @@ fn projective_fit(
     terms: usize,
     problem: &Uncalibrated,
     options: &Options,
-    stop: &StopToken,
 ) -> Fit {
     let (mut cameras, mut points) = (cameras.to_vec(), points.to_vec());
-    let report = projective::adjust(&mut cameras, &mut points, problem.observations, options, stop);
+    let report = projective::adjust(&mut cameras, &mut points, problem.observations, options, problem.stop);
     Fit::projective(report.cost, problem, problem.observed_points(), terms)
 }
 

@@ -32,10 +32,9 @@ use super::error::Error;
 use critical::Upgrade;
 use fit::Fit;
 pub use options::{CalibrationOptions, FitOptions, GradeOptions};
-use search::Search;
 
 /// A projective reconstruction to calibrate; inliers only.
-#[derive(Debug, Clone, Copy)]
+#[derive(Clone, Copy)]
 pub struct Uncalibrated<'a> {
     /// 3x4, any projective frame and scale.
     pub cameras: &'a [Matrix3x4<f64>],
@@ -53,7 +52,12 @@ pub struct Uncalibrated<'a> {
     pub focal_priors: &'a [Option<FocalPrior>],
     /// Whether every view has a focal length of its own.
     pub focal_per_view: bool,
+    /// Length of a normalised unit in pixels.
+    pub scale_px: f64,
     pub options: &'a CalibrationOptions,
+    pub stop: &'a StopToken,
+    /// Called after each step of the calibration, of which a large problem takes some tenths of a second.
+    pub heartbeat: &'a dyn Fn(),
 }
 
 impl Uncalibrated<'_> {
@@ -172,34 +176,30 @@ impl Outcome {
 
 /// Calibrates a projective reconstruction and grades the result, one a camera group.
 ///
-/// `scale_px` is the length of a normalised unit in pixels, for the words of the warnings.
-///
 /// # Errors
-/// [`Error::Stopped`] when `stop` fired; what stands by then is not worth returning.
-pub fn calibrate(problem: &Uncalibrated, scale_px: f64, stop: &StopToken) -> Result<Vec<Outcome>, Error> {
+/// [`Error::Stopped`] when the problem's token fired; what stands by then is not worth returning.
+pub fn calibrate(problem: &Uncalibrated) -> Result<Vec<Outcome>, Error> {
     let all = &problem.with_least_noise();
-    let supported = critical::without_unsupported(all, stop);
+    let supported = critical::without_unsupported(all);
     let of_supported = supported.as_ref().map(|observations| Uncalibrated { observations, ..*all });
-    let compared =
-        of_supported.as_ref().map(|some| Compared::new(some, some, scale_px, stop, &mut || ())).transpose()?;
+    let compared = of_supported.as_ref().map(|some| Compared::new(some, some)).transpose()?;
     // What is not supported may be the scene, where all else stands still in the image, and the depth of a camera that
     // moves straight on.
     let (problem, compared) = match of_supported.as_ref().zip(compared) {
         Some(found) if !matches!(found.1.critical.upgrade, Upgrade::None) => found,
-        _ => (all, Compared::new(all, all, scale_px, stop, &mut || ())?),
+        _ => (all, Compared::new(all, all)?),
     };
     let Compared { cameras, points, mut fit, critical, mut warnings } = compared;
     warnings.extend(critical.warnings);
-    let choice = models::Choice { problem, scale_px, stop };
     if let Upgrade::Rotation { free, .. } = &critical.upgrade {
         fit = *free;
     }
-    let priors = choice.priors(fit.noise);
-    let search = choice.search(&priors);
+    let priors = problem.priors(fit.noise);
+    let search = problem.search(&priors);
     let from_plane = |plane: &Homographies| {
         let group_of = if problem.focal_per_view { &vec![0; problem.cameras.len()] } else { problem.group_of };
-        let starts =
-            planar::upgrades(plane, group_of, problem.observations, problem.options.search.planar_starts, stop);
+        let most = problem.options.search.planar_starts;
+        let starts = planar::upgrades(plane, group_of, problem.observations, most, problem.stop);
         search.minima_from(starts)
     };
     let minima = match (critical.upgrade, problem.focal_priors) {
@@ -214,7 +214,7 @@ pub fn calibrate(problem: &Uncalibrated, scale_px: f64, stop: &StopToken) -> Res
         (Upgrade::Plane(plane), _) => from_plane(&plane)?,
         (Upgrade::Rotation { metric, .. }, _) => search.minima_from(vec![metric])?,
         (Upgrade::Translation(translation), [Some(focal)]) => {
-            search.known_focal(&translation, focal.focal_px / scale_px)
+            search.known_focal(&translation, focal.focal_px / problem.scale_px)
         }
         (Upgrade::Translation(_) | Upgrade::None | Upgrade::Undecided, _) => return Ok(problem.refused(&warnings)),
     };
@@ -222,8 +222,9 @@ pub fn calibrate(problem: &Uncalibrated, scale_px: f64, stop: &StopToken) -> Res
         warnings.push(no_start());
         return Ok(problem.refused(&warnings));
     }
-    let selection = grading::select_among(&choice, &fit, minima, &mut warnings)?;
-    grading::grade(&choice, &fit, None, selection, warnings)
+    let model = IntrinsicsModel::focal(minima[0].reconstruction.has_own_focals());
+    let selection = grading::select(problem, &fit, minima, model, priors, &mut warnings)?;
+    grading::grade(problem, &fit, None, selection, warnings)
 }
 
 /// Some of the views of a reconstruction, which projective cameras are fitted to where they are too many for that.
@@ -238,14 +239,10 @@ pub struct Stretch<'a> {
 ///
 /// * `problem`: the projective cameras and points of `metric`
 /// * `stretch`: the views on which it is compared with projective cameras, of the same camera groups; `None`: all
-/// * `heartbeat`: called after each of its steps, of which a large problem takes some tenths of a second
 pub fn from_metric(
     problem: &Uncalibrated,
     metric: &MetricReconstruction,
     stretch: Option<Stretch>,
-    scale_px: f64,
-    stop: &StopToken,
-    heartbeat: &mut dyn FnMut(),
 ) -> Result<Vec<Outcome>, Error> {
     let problem = &problem.with_least_noise();
     let stretch = stretch.map(|stretch| Stretch { problem: stretch.problem.with_least_noise(), ..stretch });
@@ -256,7 +253,7 @@ pub fn from_metric(
     let is_fisheye = of_stretch.intrinsics.iter().any(Intrinsics::is_fisheye);
     let undistorted = is_fisheye.then(|| misfit::undistorted(of_stretch, on.observations));
     let on = &Uncalibrated { observations: undistorted.as_deref().unwrap_or(on.observations), ..*on };
-    let Compared { fit, critical, mut warnings, .. } = Compared::new(problem, on, scale_px, stop, heartbeat)?;
+    let Compared { fit, critical, mut warnings, .. } = Compared::new(problem, on)?;
     // The distortion of a fisheye may tell the focal length of a camera that did not turn, and the motion is no reason
     // for a refusal then.
     let may_tell_focal = is_fisheye && !metric.has_common_centre && matches!(critical.upgrade, Upgrade::Translation(_));
@@ -279,13 +276,12 @@ pub fn from_metric(
             return Ok(problem.refused(&warnings));
         }
     };
-    let choice = models::Choice { problem, scale_px, stop };
-    let selection = grading::select_near(&choice, &fit, metric, stretch.as_ref(), &mut warnings, heartbeat)?;
+    let selection = grading::select_near(problem, &fit, metric, stretch.as_ref(), &mut warnings)?;
     let Some(selection) = selection else {
         warnings.push(no_start());
         return Ok(problem.refused(&warnings));
     };
-    let mut outcomes = grading::grade(&choice, &fit, stretch, selection, warnings)?;
+    let mut outcomes = grading::grade(problem, &fit, stretch, selection, warnings)?;
     for outcome in outcomes.iter_mut().filter(|outcome| outcome.grade == Grade::ProjectiveOnly) {
         outcome.warnings.splice(0..0, of_refusal.iter().cloned());
     }
@@ -298,11 +294,10 @@ pub fn focal_alone(
     problem: &Uncalibrated,
     metric: &MetricReconstruction,
     prior: &IntrinsicsPrior,
-    stop: &StopToken,
 ) -> Option<(f64, f64)> {
     let priors = vec![prior.forgetting(Parameter::LogFocal)];
     let model = IntrinsicsModel::focal(metric.has_own_focals());
-    let minimum = Search { problem, priors: &priors, stop }.converged(metric.clone(), model);
+    let minimum = problem.search(&priors).converged(metric.clone(), model);
     let candidate = models::Candidate::new(minimum, model, priors, problem);
     let sigma = candidate.sigma(0, Parameter::LogFocal, model, &candidate.priors)?;
     let log_focal = candidate.minimum.log_focal();
@@ -334,26 +329,20 @@ struct Compared {
 
 impl Compared {
     /// * `on`: the problem, or a stretch of it whose projective cameras are fitted
-    fn new(
-        problem: &Uncalibrated,
-        on: &Uncalibrated,
-        scale_px: f64,
-        stop: &StopToken,
-        heartbeat: &mut dyn FnMut(),
-    ) -> Result<Self, Error> {
-        Error::check(stop)?;
+    fn new(problem: &Uncalibrated, on: &Uncalibrated) -> Result<Self, Error> {
+        Error::check(problem.stop)?;
         let options = &problem.options.fit;
         let inliers = problem.observed_points();
         let warnings = if inliers < options.least_inliers { vec![few_inliers(inliers, options)] } else { Vec::new() };
         let (mut cameras, mut points) = (on.cameras.to_vec(), on.points.to_vec());
         let adjustment = Options::squared(options.projective_iterations);
-        let report = projective::adjust(&mut cameras, &mut points, on.observations, &adjustment, stop);
+        let report = projective::adjust(&mut cameras, &mut points, on.observations, &adjustment, problem.stop);
         let fit = Fit::projective(report.cost, on, on.observed_points(), 0);
-        Error::check(stop)?;
-        heartbeat();
-        let critical = critical::find(&models::Choice { problem: on, scale_px, stop }, &fit);
-        Error::check(stop)?;
-        heartbeat();
+        Error::check(problem.stop)?;
+        (problem.heartbeat)();
+        let critical = critical::find(on, &fit);
+        Error::check(problem.stop)?;
+        (problem.heartbeat)();
         Ok(Self { cameras, points, fit, critical, warnings })
     }
 }

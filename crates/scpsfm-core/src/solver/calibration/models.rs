@@ -4,7 +4,7 @@ use super::Uncalibrated;
 use super::fit::Fit;
 use super::options::{CalibrationOptions, GradeOptions, ModelOptions};
 use super::search::{Minimum, Search};
-use crate::domain::{FocalPrior, LensProjection, StopToken, Warning, WarningCode};
+use crate::domain::{FocalPrior, LensProjection, Warning, WarningCode};
 use crate::geometry::bundle::metric::{
     Extension, Information, Intrinsics, IntrinsicsModel, IntrinsicsPrior, MetricReconstruction, Optimum, Parameter,
 };
@@ -117,42 +117,34 @@ impl Selection {
     }
 }
 
-/// What the choice of a model works with.
-#[derive(Clone, Copy)]
-pub(super) struct Choice<'a> {
-    pub problem: &'a Uncalibrated<'a>,
-    pub scale_px: f64,
-    pub stop: &'a StopToken,
-}
-
-impl Choice<'_> {
+impl Uncalibrated<'_> {
     /// What is known of the intrinsics of each group beforehand, weighed by this noise.
-    pub fn priors(&self, noise: f64) -> Vec<IntrinsicsPrior> {
-        let of_group = |focal: &Option<FocalPrior>| self.problem.options.lenses.prior(noise, *focal, self.scale_px);
-        self.problem.focal_priors.iter().map(of_group).collect()
+    pub(super) fn priors(&self, noise: f64) -> Vec<IntrinsicsPrior> {
+        let of_group = |focal: &Option<FocalPrior>| self.options.lenses.prior(noise, *focal, self.scale_px);
+        self.focal_priors.iter().map(of_group).collect()
     }
 
     /// What minima are searched by with these priors.
-    pub fn search<'s>(&'s self, priors: &'s [IntrinsicsPrior]) -> Search<'s> {
-        Search { problem: self.problem, priors, stop: self.stop }
+    pub(super) fn search<'s>(&'s self, priors: &'s [IntrinsicsPrior]) -> Search<'s> {
+        Search { problem: self, priors }
     }
 
     fn significant_gain(&self, extension: Extension) -> f64 {
-        let freedom = self.problem.groups() * extension.parameters().len();
-        self.problem.options.models.significant_gain(freedom)
+        let freedom = self.groups() * extension.parameters().len();
+        self.options.models.significant_gain(freedom)
     }
 
     /// The minimum of a model from here, with the prior weighed by the noise that this leaves.
     ///
     /// * `noise`: to begin with
-    pub fn adjusted(&self, from: MetricReconstruction, model: IntrinsicsModel, mut noise: f64) -> Candidate {
+    pub(super) fn adjusted(&self, from: MetricReconstruction, model: IntrinsicsModel, mut noise: f64) -> Candidate {
         let adjusted = |from: MetricReconstruction, noise: f64| {
             let priors = self.priors(noise);
             let minimum = self.search(&priors).converged(from, model);
-            Candidate::new(minimum, model, priors, self.problem)
+            Candidate::new(minimum, model, priors, self)
         };
         let mut found = adjusted(from, noise);
-        let options = &self.problem.options.models;
+        let options = &self.options.models;
         for _ in 1..options.noise_rounds {
             if (options.same_noise..=1.0 / options.same_noise).contains(&(found.fit.noise / noise)) {
                 break;
@@ -166,11 +158,11 @@ impl Choice<'_> {
     /// What a model that was chosen by more views makes of these alone.
     ///
     /// * `metric`: near its minimum
-    pub fn on_stretch(&self, chosen: &Candidate, metric: &MetricReconstruction) -> Candidate {
+    pub(super) fn on_stretch(&self, chosen: &Candidate, metric: &MetricReconstruction) -> Candidate {
         let intrinsics = chosen.minimum.reconstruction.intrinsics.clone();
         let reconstruction = MetricReconstruction { intrinsics, ..metric.clone() };
         let minimum = self.search(&chosen.priors).converged(reconstruction, chosen.model);
-        Candidate::new(minimum, chosen.model, chosen.priors.clone(), self.problem)
+        Candidate::new(minimum, chosen.model, chosen.priors.clone(), self)
     }
 
     /// The model that the data carry, from one that is near: without the extensions that they do not ask for, and with
@@ -242,7 +234,7 @@ impl Choice<'_> {
     ///
     /// * `minima`: others, put behind fisheyes where those become the best
     /// * `warnings`: those of the best are added
-    pub fn select_of_any_projection(
+    pub(super) fn select_of_any_projection(
         &self,
         from: Candidate,
         minima: &mut [Minimum],
@@ -250,7 +242,7 @@ impl Choice<'_> {
     ) -> Result<Selection, Error> {
         let mut of_model = Vec::new();
         let mut found = self.select(from, &mut of_model)?;
-        let ModelOptions { fisheye_from, perspective_up_to, significant_gain_of_one, .. } = self.problem.options.models;
+        let ModelOptions { fisheye_from, perspective_up_to, significant_gain_of_one, .. } = self.options.models;
         let best = &found.best;
         let may_be_fisheye =
             |lens: &Intrinsics, radius: f64| !lens.is_fisheye() && lens.radial[0] < 0.0 && radius > fisheye_from;
@@ -264,7 +256,7 @@ impl Choice<'_> {
             let from = self.adjusted(from.reconstruction, simplest, best.fit.noise);
             let other = self.select(from, &mut of_fisheyes)?;
             let parameters = |candidate: &Candidate| candidate.model.parameters().len() as f64;
-            let added = 1.0 + (parameters(&other.best) - parameters(best)) * self.problem.groups() as f64;
+            let added = 1.0 + (parameters(&other.best) - parameters(best)) * self.groups() as f64;
             let gain = (best.fit.cost - other.best.fit.cost) / best.fit.noise.min(other.best.fit.noise).powi(2);
             if gain <= added * significant_gain_of_one {
                 found.tried.extend(other.tried.into_iter().chain([other.best]));
@@ -297,8 +289,8 @@ impl Choice<'_> {
     /// may lower sigma.
     ///
     /// * `fit`: of projective cameras; a lens that does not fit adds to their noise
-    pub fn may_be_observable(&self, best: &Candidate, fit: &Fit) -> bool {
-        let CalibrationOptions { models, grades, .. } = self.problem.options;
+    pub(super) fn may_be_observable(&self, best: &Candidate, fit: &Fit) -> bool {
+        let CalibrationOptions { models, grades, .. } = self.options;
         let Some(optimum) = best.optimum(best.model, &best.priors) else { return false };
         let limit = models.sigma_inflation * grades.weak_up_to;
         let noise = best.fit.noise.min(fit.noise);
@@ -309,7 +301,7 @@ impl Choice<'_> {
         if focals.is_empty() {
             let focal = Parameter::LogFocal;
             let of_group = |group: usize| (optimum.variance_of(group, focal), optimum.shift_of(group, focal));
-            return (0..self.problem.groups()).any(|group| is_determined(&of_group(group)));
+            return (0..self.groups()).any(|group| is_determined(&of_group(group)));
         }
         let of_views = best.own_focals(&optimum).into_iter().zip(focals);
         let of_views = of_views.map(|((variance, there), here)| (variance, there - here.ln()));
@@ -322,8 +314,8 @@ impl Choice<'_> {
         reconstruction: &MetricReconstruction,
         is_replaced: impl Fn(&Intrinsics, f64) -> bool,
     ) -> Option<Vec<Option<f64>>> {
-        let mut radii = vec![0.0f64; self.problem.groups()];
-        for seen in self.problem.observations {
+        let mut radii = vec![0.0f64; self.groups()];
+        for seen in self.observations {
             if let Some(ray) = reconstruction.intrinsics_of(seen.view).ray(&seen.xy) {
                 let of_group = &mut radii[reconstruction.group_of[seen.view]];
                 *of_group = of_group.max(ray.norm());
@@ -338,7 +330,7 @@ impl Choice<'_> {
     /// Extensions to try to do without, those that gain least first: the linearisation predicts less than a multiple
     /// (one over `worth_a_trial`) of the significant gain, or a focal length that is too uncertain.
     fn doubtful(&self, best: &Candidate) -> Vec<Extension> {
-        let CalibrationOptions { models, grades: GradeOptions { metric_below, .. }, .. } = self.problem.options;
+        let CalibrationOptions { models, grades: GradeOptions { metric_below, .. }, .. } = self.options;
         let Some(here) = best.optimum(best.model, &best.priors) else { return Vec::new() };
         let doubt = |extension: Extension| {
             let simpler = best.model.without(extension);
@@ -349,8 +341,8 @@ impl Choice<'_> {
                 let simple = best.sigma(group, Parameter::LogFocal, simpler, &best.priors).unwrap_or(f64::INFINITY);
                 rich == f64::INFINITY || rich > metric_below.max(models.sigma_inflation * simple)
             };
-            let is_doubtful = gain * models.worth_a_trial < self.significant_gain(extension)
-                || (0..self.problem.groups()).any(inflates);
+            let is_doubtful =
+                gain * models.worth_a_trial < self.significant_gain(extension) || (0..self.groups()).any(inflates);
             is_doubtful.then_some((extension, gain))
         };
         let mut found: Vec<(Extension, f64)> = best.model.removable().filter_map(doubt).collect();
@@ -366,7 +358,7 @@ impl Choice<'_> {
             let left = (best.fit.cost + there.delta_cost).max(0.0) / best.fit.cost.max(f64::MIN_POSITIVE);
             let gain = (here.delta_cost - there.delta_cost) / (best.fit.noise.powi(2) * left.max(f64::EPSILON));
             let needed = self.significant_gain(extension);
-            (gain > self.problem.options.models.worth_a_trial * needed).then_some((extension, gain - needed))
+            (gain > self.options.models.worth_a_trial * needed).then_some((extension, gain - needed))
         };
         let mut found: Vec<(Extension, f64)> = Extension::ALL
             .into_iter()
@@ -393,14 +385,14 @@ impl Choice<'_> {
         if gain <= self.significant_gain(extension) {
             return false;
         }
-        let CalibrationOptions { models, grades: GradeOptions { metric_below, .. }, .. } = self.problem.options;
+        let CalibrationOptions { models, grades: GradeOptions { metric_below, .. }, .. } = self.options;
         let observable = |group: usize| match (best.sigma_of_focal(group), richer.sigma_of_focal(group)) {
             (Some(simple), Some(rich)) => rich <= metric_below.max(models.sigma_inflation * simple),
             (Some(_), None) => false,
             // What neither model determines of one group says nothing of the others.
-            (None, rich) => rich.is_some() || self.problem.groups() > 1,
+            (None, rich) => rich.is_some() || self.groups() > 1,
         };
-        if (0..self.problem.groups()).all(observable) {
+        if (0..self.groups()).all(observable) {
             return true;
         }
         let shift = (richer.minimum.log_focal() - best.minimum.log_focal()).abs();

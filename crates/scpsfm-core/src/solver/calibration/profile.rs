@@ -2,9 +2,10 @@
 
 use nalgebra::Vector2;
 
-use super::models::{Candidate, Choice};
+use super::Uncalibrated;
+use super::models::Candidate;
 use crate::geometry::bundle::Options;
-use crate::geometry::bundle::metric::{Intrinsics, IntrinsicsPrior, MetricReconstruction, Parameter};
+use crate::geometry::bundle::metric::{IntrinsicsModel, IntrinsicsPrior, MetricReconstruction};
 use crate::geometry::bundle::sequence;
 use crate::geometry::observation::Observation;
 use crate::geometry::statistics::chi_square_quantile;
@@ -19,16 +20,16 @@ pub(super) struct Profile {
     pub correlation: f64,
 }
 
-impl Choice<'_> {
+impl Uncalibrated<'_> {
     /// Holds the focal length, of several groups all in their ratios, three standard deviations away to either side,
     /// while everything else adjusts.
     ///
     /// The chi-square should rise by nine. Near critical motions the linearisation is optimistic: it is taken where the
     /// noise has moved the scene.
-    pub fn profile(&self, best: &Candidate) -> Profile {
+    pub(super) fn profile(&self, best: &Candidate) -> Profile {
         let none = Profile { widening: 1.0, correlation: 1.0 };
         let Some(sigma) = best.sigma_log_focal() else { return none };
-        let options = &self.problem.options.models;
+        let options = &self.options.models;
         let shift = (options.profile_deviations * sigma).min(options.profile_longest);
         if shift <= 0.0 {
             return none;
@@ -44,14 +45,10 @@ impl Choice<'_> {
     fn held(&self, best: &Candidate, shift: f64) -> (MetricReconstruction, f64) {
         let mut moved = best.minimum.reconstruction.clone();
         moved.scale_focals(shift.exp());
-        let options = Options::squared(self.problem.options.models.profile_iterations);
-        let (observations, model) = (self.problem.observations, best.model.without_focal());
+        let options = Options::squared(self.options.models.profile_iterations);
+        let (observations, model) = (self.observations, best.model.without_focal());
         let report = sequence::adjust_all(&mut moved, observations, model, &best.priors, &options, self.stop);
-        let of_group = |(prior, intrinsics): (&IntrinsicsPrior, &Intrinsics)| {
-            let deviation = prior.deviation(Parameter::LogFocal, intrinsics);
-            prior.information[Parameter::LogFocal as usize] * deviation.powi(2)
-        };
-        let of_priors: f64 = best.priors.iter().zip(&moved.intrinsics).map(of_group).sum();
+        let of_priors = IntrinsicsPrior::cost_of(&best.priors, IntrinsicsModel::FOCAL, &moved.intrinsics);
         let rise = (report.cost + of_priors - best.minimum.cost).max(0.0) / best.fit.noise.powi(2);
         (moved, rise)
     }
@@ -67,12 +64,12 @@ impl Choice<'_> {
     /// * `along`: derivative of an observation's residual by the log focal length, everything else following
     fn correlation(&self, best: &Candidate, along: impl Fn(&Observation) -> Vector2<f64>) -> f64 {
         let reconstruction = &best.minimum.reconstruction;
-        if reconstruction.has_own_focals() || self.problem.groups() > 1 {
+        if reconstruction.has_own_focals() || self.groups() > 1 {
             return 1.0;
         }
         // Score and information of each track.
         let mut of_track = vec![(0.0, 0.0); reconstruction.points.len()];
-        for seen in self.problem.observations {
+        for seen in self.observations {
             let (along, (score, information)) = (along(seen), &mut of_track[seen.point]);
             *score += seen.weight * along.dot(&reconstruction.residual(seen));
             *information += seen.weight * along.norm_squared();
@@ -82,13 +79,13 @@ impl Choice<'_> {
         let pull = sum(&|(score, _)| *score) / information;
         let squared_scores = sum(&|(score, information)| (score - pull * information).powi(2));
         let (_, of_point) = MetricReconstruction::unknowns_each(reconstruction.has_common_centre);
-        let of_points = of_point * self.problem.observed_points();
-        let without_points = (2 * self.problem.observations.len()).saturating_sub(of_points);
+        let of_points = of_point * self.observed_points();
+        let without_points = (2 * self.observations.len()).saturating_sub(of_points);
         let expected = best.fit.noise.powi(2) * information * best.fit.freedom as f64 / without_points as f64;
         // So many tracks of equal information vary as much (Satterthwaite 1946).
         let tracks = information.powi(2) / sum(&|(_, information)| information.powi(2));
         let ratio = squared_scores / expected;
-        let by_chance = chi_square_quantile(tracks, self.problem.options.models.significance) / tracks;
+        let by_chance = chi_square_quantile(tracks, self.options.models.significance) / tracks;
         // Neither holds of what is no number: points may end at depth zero.
         if ratio.is_finite() && ratio > by_chance { ratio.sqrt() } else { 1.0 }
     }
@@ -101,8 +98,6 @@ mod tests {
     use rand_chacha::ChaCha8Rng;
 
     use super::*;
-    use crate::domain::StopToken;
-    use crate::geometry::bundle::metric::IntrinsicsModel;
     use crate::geometry::bundle::testing::{self, TestScene, normal};
     use crate::solver::calibration::options::CalibrationOptions;
     use crate::solver::calibration::tests::of_one_lens;
@@ -134,21 +129,21 @@ mod tests {
             let points: Vec<Vector4<f64>> = scene.points.iter().map(|point| point.push(1.0)).collect();
             let cameras = scene.cameras();
             let problem = of_one_lens(&cameras, &points, &scene.observations, NOISE);
-            let (priors, stop) = (vec![problem.options.lenses.prior(NOISE, None, 1000.0)], StopToken::default());
-            let choice = Choice { problem: &problem, scale_px: 1000.0, stop: &stop };
+            let priors = problem.priors(NOISE);
             let reconstruction = scene.reconstruction();
             for model in [IntrinsicsModel::FOCAL, IntrinsicsModel::FULL] {
-                let minimum = choice.search(&priors).converged(reconstruction.clone(), model);
+                let minimum = problem.search(&priors).converged(reconstruction.clone(), model);
                 let best = Candidate::new(minimum, model, priors.clone(), &problem);
                 let sigma = best.sigma_log_focal().expect("observable");
-                let profiled = sigma * choice.profile(&best).widening;
+                let profiled = sigma * problem.profile(&best).widening;
                 let shift = (options.profile_deviations * sigma).min(options.profile_longest);
                 let mut rise = |shift: f64| {
                     let mut moved = best.minimum.reconstruction.clone();
                     moved.scale_focals(shift.exp());
                     let options = Options { max_iterations: 5000, relative_tolerance: 1e-13, ..Options::default() };
                     let model = model.without_focal();
-                    let report = sequence::adjust_all(&mut moved, &scene.observations, model, &priors, &options, &stop);
+                    let (observations, stop) = (problem.observations, problem.stop);
+                    let report = sequence::adjust_all(&mut moved, observations, model, &priors, &options, stop);
                     longest = longest.max(report.iterations);
                     (report.cost - best.minimum.cost) / best.fit.noise.powi(2)
                 };
@@ -172,18 +167,16 @@ mod tests {
             for seed in 0..seeds {
                 let mut scene = testing::scene(seed, 10, 60, NOISE);
                 let points: Vec<Vector4<f64>> = scene.points.iter().map(|point| point.push(1.0)).collect();
-                let (cameras, stop) = (scene.cameras(), StopToken::default());
-                let observations = scene.observations.clone();
+                let (cameras, observations) = (scene.cameras(), scene.observations.clone());
                 let problem = of_one_lens(&cameras, &points, &observations, NOISE);
-                let priors = vec![problem.options.lenses.prior(NOISE, None, 1000.0)];
+                let priors = problem.priors(NOISE);
                 let truth = scene.reconstruction();
-                let best_of = |choice: &Choice| {
-                    let minimum = choice.search(&priors).converged(truth.clone(), model);
-                    Candidate::new(minimum, model, priors.clone(), choice.problem)
+                let best_of = |problem: &Uncalibrated| {
+                    let minimum = problem.search(&priors).converged(truth.clone(), model);
+                    Candidate::new(minimum, model, priors.clone(), problem)
                 };
-                let choice = Choice { problem: &problem, scale_px: 1000.0, stop: &stop };
-                let independent = best_of(&choice);
-                let [(above, _), (below, _)] = [0.01, -0.01].map(|shift| choice.held(&independent, shift));
+                let independent = best_of(&problem);
+                let [(above, _), (below, _)] = [0.01, -0.01].map(|shift| problem.held(&independent, shift));
                 let along: Vec<Vector2<f64>> =
                     observations.iter().map(|seen| above.residual(seen) - below.residual(seen)).collect();
                 let mut squared = vec![0.0; points.len()];
@@ -196,9 +189,9 @@ mod tests {
                     .iter_mut()
                     .zip(&along)
                     .for_each(|(seen, along)| seen.xy += pulls[seen.point] * along);
-                let choice = Choice { problem: &of_one_lens(&cameras, &points, &scene.observations, NOISE), ..choice };
-                let best = best_of(&choice);
-                let correlation = choice.profile(&best).correlation;
+                let problem = of_one_lens(&cameras, &points, &scene.observations, NOISE);
+                let best = best_of(&problem);
+                let correlation = problem.profile(&best).correlation;
                 let error = best.minimum.log_focal() - scene.intrinsics.focal.ln();
                 let squared = (error / best.sigma_log_focal().expect("observable")).powi(2) / seeds as f64;
                 (before, after) = (before + squared, after + squared / correlation.powi(2));

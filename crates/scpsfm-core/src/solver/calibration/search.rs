@@ -3,13 +3,12 @@
 use super::fit::Fit;
 use super::options::{CalibrationOptions, SearchOptions};
 use super::{Stretch, Uncalibrated};
-use crate::domain::StopToken;
+use crate::geometry::bundle::Options;
 use crate::geometry::bundle::critical::Translating;
 use crate::geometry::bundle::metric::{
     Information, Intrinsics, IntrinsicsModel, IntrinsicsPrior, MetricReconstruction,
 };
 use crate::geometry::bundle::sequence;
-use crate::geometry::bundle::{Options, Report};
 use crate::geometry::daq::{self, CanonicalFrame, Daq, Free};
 use crate::geometry::metric::{cheirality, retriangulate, upgrade, upgrade_translation};
 use crate::geometry::observation::Observation;
@@ -22,6 +21,8 @@ pub(super) struct Minimum {
     pub reconstruction: MetricReconstruction,
     pub cost: f64,
     pub cheirality: f64,
+    /// Whether its adjustment ended early, as its cost would not come near the one that it was compared with.
+    pub is_hopeless: bool,
 }
 
 impl Uncalibrated<'_> {
@@ -102,13 +103,12 @@ pub(super) struct Search<'a> {
     pub problem: &'a Uncalibrated<'a>,
     /// What is known of the intrinsics of each group beforehand.
     pub priors: &'a [IntrinsicsPrior],
-    pub stop: &'a StopToken,
 }
 
 impl Search<'_> {
     /// The minimum that a reconstruction converges to with this model.
     pub fn converged(&self, start: MetricReconstruction, model: IntrinsicsModel) -> Minimum {
-        self.converge(&self.problem.options.search.to_convergence(), start, model).0
+        self.converge(&self.problem.options.search.to_convergence(), start, model)
     }
 
     /// The same; `None` where its cost will not come near this one, so that it is none to compare with.
@@ -117,48 +117,35 @@ impl Search<'_> {
         // Of costs below the noise no difference tells anything.
         let told_apart = cost + grades.indistinguishable * self.problem.noise.powi(2);
         let hopeless_above = (options.hopeless_cost * cost).max(told_apart);
-        let (minimum, report) = self.converge(&Options { hopeless_above, ..options.to_convergence() }, start, model);
-        (!report.is_hopeless).then_some(minimum)
+        let minimum = self.converge(&Options { hopeless_above, ..options.to_convergence() }, start, model);
+        (!minimum.is_hopeless).then_some(minimum)
     }
 
-    /// What these converge to, cheapest first, without those whose cost will not come near the cheapest.
-    ///
-    /// * `heartbeat`: called after each
-    fn converged_all(
-        &self,
-        starts: impl IntoIterator<Item = MetricReconstruction>,
-        model: IntrinsicsModel,
-        heartbeat: &mut dyn FnMut(),
-    ) -> Result<Vec<Minimum>, Error> {
-        self.converged_below(f64::INFINITY, starts, model, heartbeat)
-    }
-
-    /// The same, without those whose cost will not come near this one either.
+    /// What these converge to, cheapest first, without those whose cost will not come near the cheapest, or this one.
     fn converged_below(
         &self,
         mut cheapest: f64,
         starts: impl IntoIterator<Item = MetricReconstruction>,
         model: IntrinsicsModel,
-        heartbeat: &mut dyn FnMut(),
     ) -> Result<Vec<Minimum>, Error> {
         let mut found = Vec::new();
         for start in starts {
-            Error::check(self.stop)?;
+            Error::check(self.problem.stop)?;
             if let Some(minimum) = self.converged_near(start, model, cheapest) {
                 cheapest = cheapest.min(minimum.cost);
                 found.push(minimum);
             }
-            heartbeat();
+            (self.problem.heartbeat)();
         }
-        Error::check(self.stop)?;
+        Error::check(self.problem.stop)?;
         Ok(distinct(found, self.problem))
     }
 
     /// Adjusts, and once more where points that diverged were triangulated anew.
-    fn converge(&self, options: &Options, start: MetricReconstruction, model: IntrinsicsModel) -> (Minimum, Report) {
-        let (mut minimum, report) = self.run(options, start, model);
-        let again = !report.is_hopeless && self.retriangulate_diverged(&mut minimum.reconstruction);
-        if again { self.run(options, minimum.reconstruction, model) } else { (minimum, report) }
+    fn converge(&self, options: &Options, start: MetricReconstruction, model: IntrinsicsModel) -> Minimum {
+        let mut minimum = self.adjusted(options, start, model);
+        let again = !minimum.is_hopeless && self.retriangulate_diverged(&mut minimum.reconstruction);
+        if again { self.adjusted(options, minimum.reconstruction, model) } else { minimum }
     }
 
     /// Triangulates the points anew that diverged on the way to a minimum; whether any moved.
@@ -184,15 +171,13 @@ impl Search<'_> {
         retriangulate(reconstruction, self.problem.observations, &diverged) > 0
     }
 
+    /// What a start comes to with these options, a minimum or not yet.
     fn adjusted(&self, options: &Options, start: MetricReconstruction, model: IntrinsicsModel) -> Minimum {
-        self.run(options, start, model).0
-    }
-
-    fn run(&self, options: &Options, start: MetricReconstruction, model: IntrinsicsModel) -> (Minimum, Report) {
-        let (mut reconstruction, observations) = (start, self.problem.observations);
-        let report = sequence::adjust_all(&mut reconstruction, observations, model, self.priors, options, self.stop);
+        let Uncalibrated { observations, stop, .. } = *self.problem;
+        let mut reconstruction = start;
+        let report = sequence::adjust_all(&mut reconstruction, observations, model, self.priors, options, stop);
         let cheirality = cheirality(&reconstruction, observations);
-        (Minimum { reconstruction, cost: report.cost, cheirality }, report)
+        Minimum { reconstruction, cost: report.cost, cheirality, is_hopeless: report.is_hopeless }
     }
 
     /// Minima that are reached from other focal lengths than that of a metric reconstruction, cheapest first. Those far
@@ -200,14 +185,12 @@ impl Search<'_> {
     ///
     /// * `cost`: of the minimum near `metric`
     /// * `stretch`: some of the views, where they are many: all are adjusted from the focal lengths found there
-    /// * `heartbeat`: called after each
     pub fn minima_from_other_focals(
         &self,
         metric: &MetricReconstruction,
         model: IntrinsicsModel,
         cost: f64,
         stretch: Option<&Stretch>,
-        heartbeat: &mut dyn FnMut(),
     ) -> Result<Vec<Minimum>, Error> {
         let options = &self.problem.options.search;
         let following = Options { max_iterations: options.following_iterations, ..Options::default() };
@@ -221,14 +204,14 @@ impl Search<'_> {
             let search = Search { problem: &stretch.problem, ..*self };
             let here = MetricReconstruction { intrinsics: metric.intrinsics.clone(), ..stretch.metric.clone() };
             let near = search.converged(here.clone(), model);
-            heartbeat();
+            (self.problem.heartbeat)();
             let starts = factors.iter().map(|&factor| start(&search, &here, factor));
-            let found = search.converged_below(near.cost, starts, model, heartbeat)?;
+            let found = search.converged_below(near.cost, starts, model)?;
             factors = found.iter().map(|other| (other.log_focal() - near.log_focal()).exp()).collect();
             factors.retain(|factor| factor.ln().abs() > options.same_minimum);
         }
         let starts = factors.iter().map(|&factor| start(self, metric, factor));
-        self.converged_below(cost, starts, model, heartbeat)
+        self.converged_below(cost, starts, model)
     }
 
     /// Metric reconstructions with the focal length free, or one of each view, that different starts converge to,
@@ -247,7 +230,7 @@ impl Search<'_> {
         let alone = Uncalibrated { group_of: &vec![0; frame.cameras.len()], focal_priors: &[None], ..*problem };
         let found = Search { problem: &alone, ..*self }.minima_per_view(frame)?;
         let in_groups = |minimum: Minimum| minimum.reconstruction.in_groups(problem.group_of, problem.groups());
-        self.converged_all(found.into_iter().map(in_groups), IntrinsicsModel::FOCAL, &mut || ())
+        self.converged_below(f64::INFINITY, found.into_iter().map(in_groups), IntrinsicsModel::FOCAL)
     }
 
     /// With a focal length a view, of which nothing is known: from the quadrics that allow for that, and from the
@@ -269,12 +252,12 @@ impl Search<'_> {
         }
         let mut found = Vec::with_capacity(starts.len());
         for reconstruction in starts {
-            Error::check(self.stop)?;
+            Error::check(self.problem.stop)?;
             found.push(search.adjusted(&options.first(), reconstruction, model));
         }
         let mut found = distinct(found, problem);
         found.truncate(options.converged);
-        search.converged_all(found.into_iter().map(|minimum| minimum.reconstruction), model, &mut || ())
+        search.converged_below(f64::INFINITY, found.into_iter().map(|minimum| minimum.reconstruction), model)
     }
 
     /// With one focal length for all views.
@@ -285,7 +268,7 @@ impl Search<'_> {
         let mut converged: Vec<Minimum> = Vec::new();
         let mut cheapest = f64::INFINITY;
         for start in on_subset.starts_of_one(frame)? {
-            Error::check(self.stop)?;
+            Error::check(self.problem.stop)?;
             let Some(mut minimum) = on_subset.converged_near(start.reconstruction, model, cheapest) else { continue };
             cheapest = cheapest.min(minimum.cost);
             if let Some(thinned) = &thinned {
@@ -294,7 +277,7 @@ impl Search<'_> {
             }
             converged.push(minimum);
         }
-        Error::check(self.stop)?;
+        Error::check(self.problem.stop)?;
         Ok(distinct(converged, problem))
     }
 
@@ -304,7 +287,7 @@ impl Search<'_> {
         let options = &self.problem.options.search;
         let mut found: Vec<Minimum> = Vec::new();
         for start in starts(frame, options) {
-            Error::check(self.stop)?;
+            Error::check(self.problem.stop)?;
             let Some(start) = upgrade(frame, &start, false, self.problem.observations) else { continue };
             found.push(self.adjusted(&options.first(), start, IntrinsicsModel::FOCAL));
         }
@@ -324,7 +307,7 @@ impl Search<'_> {
                 false => start.in_groups(problem.group_of, problem.groups()),
             }
         };
-        self.converged_all(starts.into_iter().map(start), model, &mut || ())
+        self.converged_below(f64::INFINITY, starts.into_iter().map(start), model)
     }
 
     /// The metric reconstruction of a camera that moved without turning, from a focal length that is known otherwise;

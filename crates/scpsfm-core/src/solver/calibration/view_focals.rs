@@ -3,7 +3,7 @@
 
 use super::averaging::Sigmas;
 use super::fit::Fit;
-use super::models::{Candidate, Choice};
+use super::models::Candidate;
 use super::options::{GradeOptions, LensOptions};
 use super::verdict::Verdict;
 use super::{Uncalibrated, ViewFocal};
@@ -79,10 +79,9 @@ pub(super) struct Differing {
 /// by more than chance; if so, what they are.
 ///
 /// * `own`: the fit of `metric`
-pub(super) fn differing(metric: &MetricReconstruction, own: &Fit, choice: &Choice) -> Option<Differing> {
-    let problem: &Uncalibrated = choice.problem;
+pub(super) fn differing(metric: &MetricReconstruction, own: &Fit, problem: &Uncalibrated) -> Option<Differing> {
     let options = problem.options;
-    let priors = vec![options.lenses.prior(own.noise, None, choice.scale_px); problem.groups()];
+    let priors = vec![options.lenses.prior(own.noise, None, problem.scale_px); problem.groups()];
     let model = IntrinsicsModel::FOCAL_PER_VIEW.with(Extension::PrincipalPoint).with(Extension::RadialK1);
     let mut freed = metric.clone().with_own_focals();
     let report = sequence::adjust_all(
@@ -91,7 +90,7 @@ pub(super) fn differing(metric: &MetricReconstruction, own: &Fit, choice: &Choic
         model,
         &priors,
         &options.search.to_convergence(),
-        choice.stop,
+        problem.stop,
     );
     if !Fit::metric(report.cost, &freed, model, problem).refutes(own, &options.fit) {
         return None;

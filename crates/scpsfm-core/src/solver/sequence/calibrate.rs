@@ -1,5 +1,7 @@
 //! What the whole sequence says of the calibration of each camera.
 
+use std::cell::RefCell;
+
 use super::adjust::{self, Extract};
 use super::calibrated_views::{core, of_extract, of_view, report_found, take_over, too_few};
 use super::model::Model;
@@ -125,7 +127,9 @@ fn of_run(
 ) -> Result<(Extract, Vec<(usize, Outcome)>), Error> {
     let extract = core(problem, model, views, of_view(views));
     let stretch = stretch.map(|stretch| core(problem, model, stretch, of_view(stretch)));
-    let found = of_extract(problem, &extract, stretch.as_ref(), model.noise, &mut || recorder.heartbeat())?;
+    let recorder = RefCell::new(recorder);
+    let heartbeat = || recorder.borrow_mut().heartbeat();
+    let found = of_extract(problem, &extract, stretch.as_ref(), model.noise, &heartbeat)?;
     Ok((extract, found))
 }
 

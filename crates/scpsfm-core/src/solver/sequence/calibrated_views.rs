@@ -23,13 +23,13 @@ const OFF_CENTRE: f64 = 0.01;
 /// The calibrations of the cameras of some views.
 ///
 /// * `stretch`: some of them, of the same cameras, where they are many
-/// * `heartbeat`: called now and then
+/// * `heartbeat`: as of [`Uncalibrated`]
 pub fn of_extract(
     problem: &Problem,
     extract: &Extract,
     stretch: Option<&Extract>,
     noise: f64,
-    heartbeat: &mut dyn FnMut(),
+    heartbeat: &dyn Fn(),
 ) -> Result<Vec<(usize, Outcome)>, Error> {
     let (metric, of_group) = extract.block();
     let focal_priors: Vec<Option<FocalPrior>> = of_group.iter().map(|&camera| problem.focal_priors[camera]).collect();
@@ -39,12 +39,11 @@ pub fn of_extract(
         (ProjectiveExtract::of(&metric), metric, &extract.observations)
     });
     let stretch = stretch.as_ref().map(|(projective, metric, observations)| calibration::Stretch {
-        problem: projective.uncalibrated(problem, metric, observations, &focal_priors, noise),
+        problem: projective.uncalibrated(problem, metric, observations, &focal_priors, noise, heartbeat),
         metric,
     });
-    let to_calibrate = all.uncalibrated(problem, &metric, &extract.observations, &focal_priors, noise);
-    let outcomes =
-        calibration::from_metric(&to_calibrate, &metric, stretch, problem.scale_px, problem.stop, heartbeat)?;
+    let to_calibrate = all.uncalibrated(problem, &metric, &extract.observations, &focal_priors, noise, heartbeat);
+    let outcomes = calibration::from_metric(&to_calibrate, &metric, stretch)?;
     Ok(of_group.into_iter().zip(outcomes).collect())
 }
 
@@ -103,6 +102,7 @@ impl ProjectiveExtract {
         observations: &'a [Observation],
         focal_priors: &'a [Option<FocalPrior>],
         noise: f64,
+        heartbeat: &'a dyn Fn(),
     ) -> Uncalibrated<'a> {
         Uncalibrated {
             cameras: &self.cameras,
@@ -113,7 +113,10 @@ impl ProjectiveExtract {
             group_of: &metric.group_of,
             focal_priors,
             focal_per_view: metric.has_own_focals(),
+            scale_px: problem.scale_px,
             options: &problem.calibration_options,
+            stop: problem.stop,
+            heartbeat,
         }
     }
 }

@@ -3,6 +3,8 @@
 //! What one view's focal length is, its neighbours say and no others: the sequence is asked run after run, and views
 //! whose focal length nothing determines have none, rather than that of the rest.
 
+use std::cell::RefCell;
+
 use super::adjust::{self, Extract};
 use super::calibrated_views::{self, too_few};
 use super::model::Model;
@@ -23,17 +25,18 @@ const CAMERA: usize = 0;
 pub fn calibrate(problem: &Problem, model: &mut Model, recorder: &mut Recorder) -> Result<Outcome, Error> {
     let registered = model.registered();
     let runs = runs(model);
-    let of_run = |k: usize, heartbeat: &mut dyn FnMut()| {
+    let of_run = |k: usize, heartbeat: &dyn Fn()| {
         let extract = calibrated_views::core(problem, model, runs.get(k)?, calibrated_views::of_view(&runs[k]));
         let found = calibrated_views::of_extract(problem, &extract, None, model.noise, heartbeat).ok()?;
         found.into_iter().next().map(|(_, outcome)| (extract, outcome))
     };
     let found = if runs.len() == 1 {
         recorder.step(Task::Cameras, 1, 1, 0.0);
-        vec![of_run(0, &mut || recorder.heartbeat())]
+        let recorder = RefCell::new(&mut *recorder);
+        vec![of_run(0, &|| recorder.borrow_mut().heartbeat())]
     } else {
         let mut progress = |k: usize| recorder.step(Task::Cameras, k + 1, runs.len(), 0.0);
-        problem.threads.map(runs.len(), 1, |k| of_run(k, &mut || {}), &mut progress)
+        problem.threads.map(runs.len(), 1, |k| of_run(k, &|| ()), &mut progress)
     };
     problem.stopped()?;
     let mut found: Vec<(Extract, Outcome)> = found.into_iter().flatten().collect();

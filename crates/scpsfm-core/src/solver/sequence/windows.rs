@@ -101,9 +101,9 @@ fn moved_alone(problem: &Problem, model: &Model, camera: usize, views: &[usize])
     let extract = calibrated_views::core(problem, model, views, OPTIONS.of_view);
     let (metric, _) = extract.block();
     let projective = ProjectiveExtract::of(&metric);
-    let to_calibrate = projective.uncalibrated(problem, &metric, &extract.observations, &[None], model.noise);
+    let to_calibrate = projective.uncalibrated(problem, &metric, &extract.observations, &[None], model.noise, &|| ());
     let prior = adjust::intrinsics_prior(problem, camera, model.noise);
-    let (log_focal, sigma) = calibration::focal_alone(&to_calibrate, &metric, &prior, problem.stop)?;
+    let (log_focal, sigma) = calibration::focal_alone(&to_calibrate, &metric, &prior)?;
     Some(Estimate { log_focal: log_focal - metric.log_focal(), sigma })
 }
 

@@ -132,7 +132,7 @@ fn one_wrong_track_gives_a_rotation_no_depth() {
         let directions = scene.points.iter().map(|point| (point - centre).push(0.0));
         let points: Vec<Vector4<f64>> = directions.chain([Vector4::w()]).collect();
         let problem = of_one_lens(&cameras, &points, &scene.observations, NOISE);
-        let outcome = only(calibrate(&problem, SIDE_PX, &StopToken::default()));
+        let outcome = only(calibrate(&problem));
         println!("seed {seed}: {:?}, {:?}", outcome.grade, outcome.warnings);
         assert!(codes(&outcome).contains(&"PURE_ROTATION"), "seed {seed}: {:?}", outcome.warnings);
         let (error, sigma) = (focal_error(&outcome, &scene), outcome.sigma_log_focal.expect("graded"));
@@ -205,7 +205,7 @@ fn supported(scene: &TestScene) -> Option<Vec<Observation>> {
     let cameras = scene.cameras();
     let points: Vec<Vector4<f64>> = scene.points.iter().map(|point| point.push(1.0)).collect();
     let problem = of_one_lens(&cameras, &points, &scene.observations, NOISE);
-    crate::solver::calibration::critical::without_unsupported(&problem, &StopToken::default())
+    crate::solver::calibration::critical::without_unsupported(&problem)
 }
 
 /// Homographies of a plane have room for a focal length of each view of a camera that only turns.
@@ -247,7 +247,7 @@ fn two_groups_before_a_plane_and_from_one_centre_are_told_apart() {
                 focal_priors: &[None, None],
                 ..of_one_lens(&cameras, &points, &scene.observations, 0.001)
             };
-            let outcomes = calibrate(&problem, SIDE_PX, &StopToken::default()).expect("not stopped");
+            let outcomes = calibrate(&problem).expect("not stopped");
             for (outcome, factor) in outcomes.iter().zip([1.0, 1.2]) {
                 let Some((intrinsics, sigma)) = outcome.intrinsics().zip(outcome.sigma_log_focal) else { continue };
                 let error = (intrinsics.focal / (factor * scene.intrinsics.focal)).ln();

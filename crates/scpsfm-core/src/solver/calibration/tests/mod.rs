@@ -5,12 +5,15 @@ mod critical;
 mod models;
 mod view_focals;
 
+use std::sync::LazyLock;
+
 use super::*;
 use crate::domain::StopReason;
 use crate::geometry::bundle::testing::{self, Motion, NOISE, TestScene};
 use crate::geometry::observation::Observation;
 
 const SIDE_PX: f64 = 1000.0;
+static NEVER_STOPPED: LazyLock<StopToken> = LazyLock::new(StopToken::default);
 
 /// A scene as the solver would hand it over: in a projective frame of its own, adjusted to the noisy observations.
 fn projective_problem(scene: &TestScene, seed: u64) -> (Vec<Matrix3x4<f64>>, Vec<Vector4<f64>>) {
@@ -37,7 +40,10 @@ pub fn of_one_lens<'a>(
         group_of,
         focal_priors: &[None],
         focal_per_view: false,
+        scale_px: SIDE_PX,
         options,
+        stop: &NEVER_STOPPED,
+        heartbeat: &|| (),
     }
 }
 
@@ -50,7 +56,7 @@ fn the_options_bound_the_grades() {
         let mut options = CalibrationOptions::DEFAULT;
         (options.grades.metric_below, options.grades.weak_up_to) = (metric_below, weak_up_to);
         let problem = Uncalibrated { options: &options, ..of_one_lens(&cameras, &points, &scene.observations, 1e-3) };
-        only(calibrate(&problem, SIDE_PX, &StopToken::default())).grade
+        only(calibrate(&problem)).grade
     };
     assert_eq!(grade(0.02, 0.1), Grade::Metric);
     assert_eq!(grade(1e-9, 0.1), Grade::Weak);
@@ -69,8 +75,7 @@ fn a_diverged_point_does_not_bend_the_minimum() {
             let problem =
                 Uncalibrated { options: &options, ..of_one_lens(&cameras, &points, &scene.observations, 1e-3) };
             let priors = [IntrinsicsPrior::NONE];
-            let search = Search { problem: &problem, priors: &priors, stop: &StopToken::default() };
-            search.converged(start.clone(), IntrinsicsModel::FOCAL)
+            problem.search(&priors).converged(start.clone(), IntrinsicsModel::FOCAL)
         };
         let start = scene.reconstruction();
         let bound = CalibrationOptions::DEFAULT.search.diverged_above;
@@ -96,7 +101,7 @@ fn calibrated_knowing(scene: &TestScene, seed: u64, noise: f64, focal_prior: Opt
     let (cameras, points) = projective_problem(scene, seed);
     let focal_priors = &[focal_prior];
     let problem = Uncalibrated { focal_priors, ..of_one_lens(&cameras, &points, &scene.observations, noise) };
-    only(calibrate(&problem, SIDE_PX, &StopToken::default()))
+    only(calibrate(&problem))
 }
 
 /// The calibration of a sequence that grew to where the truth is: what a search costs is left out.
@@ -109,7 +114,7 @@ fn calibrated_from(scene: &TestScene, metric: &MetricReconstruction, noise: f64)
     let points: Vec<Vector4<f64>> = scene.points.iter().map(|point| point.push(1.0)).collect();
     let cameras = scene.cameras();
     let problem = of_one_lens(&cameras, &points, &scene.observations, noise);
-    only(from_metric(&problem, metric, None, SIDE_PX, &StopToken::default(), &mut || ()))
+    only(from_metric(&problem, metric, None))
 }
 
 /// The outcome of the only camera group.
@@ -252,7 +257,7 @@ fn hostile_input_is_refused_without_panic() {
     let (cameras, points) = projective_problem(&scene, 1);
     let run = |cameras: &[Matrix3x4<f64>], points: &[Vector4<f64>], observations: &[Observation], noise| {
         let problem = of_one_lens(cameras, points, observations, noise);
-        only(calibrate(&problem, SIDE_PX, &StopToken::default()))
+        only(calibrate(&problem))
     };
     let nothing = run(&[], &[], &[], NOISE);
     assert_eq!(nothing.grade, Grade::ProjectiveOnly);
@@ -275,8 +280,8 @@ fn hostile_input_is_refused_without_panic() {
 fn a_stopped_token_ends_it() {
     let scene = testing::scene(1, 4, 12, NOISE);
     let (cameras, points) = projective_problem(&scene, 1);
-    let problem = of_one_lens(&cameras, &points, &scene.observations, NOISE);
     let stop = StopToken::default();
+    let problem = Uncalibrated { stop: &stop, ..of_one_lens(&cameras, &points, &scene.observations, NOISE) };
     stop.stop(StopReason::Cancelled);
-    assert_eq!(calibrate(&problem, SIDE_PX, &stop).map(|_| ()), Err(Error::Stopped(StopReason::Cancelled)));
+    assert_eq!(calibrate(&problem).map(|_| ()), Err(Error::Stopped(StopReason::Cancelled)));
 }

@@ -1,10 +1,12 @@
 //! Intrinsics beyond the focal length, and what is known of it beforehand.
 
+use std::cell::Cell;
+
 use nalgebra::Vector2;
 
 use super::*;
 use crate::geometry::bundle::metric::Extension;
-use crate::solver::calibration::models::{Candidate, Choice, Selection};
+use crate::solver::calibration::models::{Candidate, Selection};
 
 #[test]
 fn a_displaced_principal_point_is_found_and_a_central_one_is_left_alone() {
@@ -174,10 +176,11 @@ fn nothing_else_is_tried_where_the_lens_leaves_the_focal_length_open() {
         metric.intrinsics[0].radial[0] = -0.01;
         let points: Vec<Vector4<f64>> = scene.points.iter().map(|point| point.push(1.0)).collect();
         let cameras = scene.cameras();
-        let problem = of_one_lens(&cameras, &points, &scene.observations, 0.001);
-        let mut steps = 0;
-        let outcomes = from_metric(&problem, &metric, None, SIDE_PX, &StopToken::default(), &mut || steps += 1);
-        let Outcome { grade, sigma_log_focal, model, .. } = only(outcomes);
+        let steps = Cell::new(0);
+        let heartbeat = &|| steps.set(steps.get() + 1);
+        let problem = Uncalibrated { heartbeat, ..of_one_lens(&cameras, &points, &scene.observations, 0.001) };
+        let Outcome { grade, sigma_log_focal, model, .. } = only(from_metric(&problem, &metric, None));
+        let steps = steps.get();
         let of = format!("turning by {max_rotation_rad}, seed {seed}");
         println!("{of}: {grade:?} {sigma_log_focal:?} after {steps} steps, {}", model.name());
         if steps == 3 {
@@ -200,17 +203,16 @@ fn what_a_descent_still_had_to_go_is_part_of_its_error() {
         let points: Vec<Vector4<f64>> = scene.points.iter().map(|point| point.push(1.0)).collect();
         let cameras = scene.cameras();
         let problem = of_one_lens(&cameras, &points, &scene.observations, 0.001);
-        let choice = Choice { problem: &problem, scale_px: SIDE_PX, stop: &StopToken::default() };
-        let search = |priors, model, start| choice.search(priors).converged(start, model);
-        let priors = choice.priors(0.001);
+        let search = |priors, model, start| problem.search(priors).converged(start, model);
+        let priors = problem.priors(0.001);
         let converged = search(&priors, IntrinsicsModel::FOCAL, scene.reconstruction()).reconstruction;
         let fit = Fit::projective(0.0, &problem, scene.points.len(), 0);
         let at = |factor: f64| {
             let start = converged.clone().with_scaled_focals(factor);
             let minimum = search(&priors, IntrinsicsModel::FIXED, start);
             let best = Candidate::new(minimum, IntrinsicsModel::FOCAL, priors.clone(), &problem);
-            let may_be_observable = choice.may_be_observable(&best, &fit);
-            let sigmas = choice.sigmas(&Selection::of(best), &priors, 1.0);
+            let may_be_observable = problem.may_be_observable(&best, &fit);
+            let sigmas = problem.sigmas(&Selection::of(best), &priors, 1.0);
             (may_be_observable, sigmas.of_group[0][Parameter::LogFocal as usize].expect("determined"))
         };
         let ((_, there), (is_near, near), (is_far, far)) = (at(1.0), at(1.03), at(1.5));

@@ -44,7 +44,7 @@ fn calibrated_as(focal_per_view: bool, scene: &TestScene, seed: u64, noise: f64)
     // Any projective frame of any cameras near the truth is adjusted to the observations.
     let (cameras, points) = projective_problem(scene, seed);
     let problem = Uncalibrated { focal_per_view, ..of_one_lens(&cameras, &points, &scene.observations, noise) };
-    only(calibrate(&problem, SIDE_PX, &StopToken::default()))
+    only(calibrate(&problem))
 }
 
 #[test]
@@ -193,7 +193,7 @@ fn near_truth(scene: &TestScene, focals: &[f64], noise: f64) -> Outcome {
     let points: Vec<Vector4<f64>> = metric.points.iter().map(|point| point.push(1.0)).collect();
     let cameras = metric.cameras();
     let problem = Uncalibrated { focal_per_view: true, ..of_one_lens(&cameras, &points, &scene.observations, noise) };
-    only(from_metric(&problem, &metric, None, SIDE_PX, &StopToken::default(), &mut || {}))
+    only(from_metric(&problem, &metric, None))
 }
 
 /// The true reconstruction with these focal lengths.
@@ -203,31 +203,27 @@ fn metric_of(scene: &TestScene, focals: &[f64]) -> MetricReconstruction {
     metric
 }
 
-fn with_choice<T>(
-    scene: &TestScene,
-    ask: impl FnOnce(&super::super::models::Choice, &Fit, &search::Minimum) -> T,
-) -> T {
+fn with_best<T>(scene: &TestScene, ask: impl FnOnce(&Uncalibrated, &Fit, &search::Minimum) -> T) -> T {
     let (cameras, points) = (scene.cameras(), scene.points.iter().map(|point| point.push(1.0)).collect::<Vec<_>>());
     let problem = Uncalibrated { focal_per_view: true, ..of_one_lens(&cameras, &points, &scene.observations, NOISE) };
-    let (prior, stop) = (problem.options.lenses.prior(NOISE, None, SIDE_PX), StopToken::default());
-    let choice = super::super::models::Choice { problem: &problem, scale_px: SIDE_PX, stop: &stop };
     let start = metric_of(scene, &vec![scene.intrinsics.focal; scene.poses.len()]);
-    let best = choice.search(&[prior]).converged(start, IntrinsicsModel::FOCAL_PER_VIEW);
+    let best = problem.search(&problem.priors(NOISE)).converged(start, IntrinsicsModel::FOCAL_PER_VIEW);
     let fit = Fit::metric(best.cost, &best.reconstruction, IntrinsicsModel::FOCAL_PER_VIEW, &problem);
-    ask(&choice, &fit, &best)
+    ask(&problem, &fit, &best)
 }
 
 #[test]
 fn another_minimum_that_explains_as_much_is_told() {
     let scene = testing::scene(1, 10, 40, NOISE);
-    with_choice(&scene, |choice, fit, best| {
+    with_best(&scene, |problem, fit, best| {
         let graded_in = |views: usize, factor: f64, cost: f64, cheirality: f64| {
             let mut rival = best.clone();
             rival.reconstruction.focals.iter_mut().take(views).for_each(|focal| *focal *= factor);
             rival = search::Minimum { cost: cost * best.cost, cheirality, ..rival };
             let minima = vec![best.clone(), rival];
-            let selection = grading::select_among(choice, fit, minima, &mut Vec::new()).expect("not stopped");
-            let outcome = only(grading::grade(choice, fit, None, selection, Vec::new()));
+            let (model, priors) = (IntrinsicsModel::FOCAL_PER_VIEW, problem.priors(fit.noise));
+            let selection = grading::select(problem, fit, minima, model, priors, &mut Vec::new()).expect("not stopped");
+            let outcome = only(grading::grade(problem, fit, None, selection, Vec::new()));
             (outcome.grade, codes(&outcome).contains(&"SECOND_MINIMUM"))
         };
         let graded = |factor: f64, cost: f64, cheirality: f64| graded_in(10, factor, cost, cheirality);
