@@ -14,7 +14,7 @@ pub enum WarningCode {
     PlanarScene,
     /// The camera turned about its centre without moving: in a metric result tracks have no points.
     PureRotation,
-    /// The camera moved without turning: every focal length fits. Forward motion is a case of it; the detail says so.
+    /// The camera moved without turning: every focal length fits. Forward motion is a case of it.
     PureTranslation,
     /// The motion leaves the focal length (nearly) free, or the one that fits best is that of no lens; the detail says
     /// which.

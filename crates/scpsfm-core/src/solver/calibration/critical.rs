@@ -2,12 +2,10 @@
 
 use std::ops::ControlFlow;
 
-use nalgebra::{Matrix3, Vector3};
-
 use super::Uncalibrated;
 use super::fit::Fit;
 use super::misfit;
-use super::options::{CalibrationOptions, CriticalOptions};
+use super::options::CalibrationOptions;
 use crate::domain::{VERIFIED, Warning, WarningCode};
 use crate::geometry::bundle::critical::{Homographies, Translating};
 use crate::geometry::bundle::metric::{Extension, IntrinsicsModel, IntrinsicsPrior, MetricReconstruction};
@@ -99,7 +97,7 @@ pub(super) fn find(problem: &Uncalibrated, fit: &Fit) -> Critical {
     let Some(translation) = translation else {
         return Critical { warnings: Vec::new(), upgrade: Upgrade::Quadric(plane) };
     };
-    let warnings = vec![pure_translation(&translation.model, options), not_turning()];
+    let warnings = vec![pure_translation(), not_turning()];
     Critical { warnings, upgrade: Upgrade::Translation(translation.model) }
 }
 
@@ -222,37 +220,8 @@ fn turns_and_zooms(
     })
 }
 
-fn pure_translation(translation: &Translating, options: &CriticalOptions) -> Warning {
-    let direction = match direction(translation, options.most_off_line) {
-        Some(heading) if heading.z != 0.0 && heading.xy().norm() <= options.near_axis * heading.z.abs() => {
-            ", along the optical axis"
-        }
-        Some(_) => ", along a line",
-        None => "",
-    };
-    let detail = format!(
-        "the camera moved without turning{direction}: cameras that are not turned to each other explain the views as \
-         well as free ones, and every focal length does so alike"
-    );
+fn pure_translation() -> Warning {
+    let detail = "the camera moved without turning: cameras that are not turned to each other explain the views as \
+                  well as free ones, and every focal length does so alike";
     Warning::new(WarningCode::PureTranslation, detail)
-}
-
-/// Direction of the line along which the camera moved, times `K`; `None` where it left the line.
-///
-/// * `most_off_line`: see [`CriticalOptions`]
-fn direction(translation: &Translating, most_off_line: f64) -> Option<Vector3<f64>> {
-    let positions = &translation.translations;
-    let mean = positions.iter().sum::<Vector3<f64>>() / positions.len().max(1) as f64;
-    let mut spread = Matrix3::zeros();
-    for position in positions {
-        spread += (position - mean) * (position - mean).transpose();
-    }
-    if spread.iter().any(|value| !value.is_finite()) {
-        return None;
-    }
-    let eigen = spread.symmetric_eigen();
-    let along = eigen.eigenvalues.imax();
-    let off: f64 = (0..3).filter(|&k| k != along).map(|k| eigen.eigenvalues[k].max(0.0)).sum();
-    let is_straight = off <= most_off_line * most_off_line * eigen.eigenvalues[along];
-    is_straight.then(|| eigen.eigenvectors.column(along).into_owned())
 }

@@ -84,12 +84,6 @@ options! {
         /// noise taken off; with parallax 215 and more. Depth, even with the short baselines of forward motion, has 50
         /// and more.
         plane_deviations: f64 = 8.0,
-        /// Spread of the camera's positions off the line that fits them best, relative to that along it, up to which
-        /// the motion is along one line. Noise leaves a few hundredths.
-        most_off_line: f64 = 0.2,
-        /// Distance of the point that a straight motion heads for from the image centre up to which it is along the
-        /// optical axis.
-        near_axis: f64 = 0.1,
     }
 }
 

@@ -24,8 +24,6 @@ fn motions_that_leave_the_focal_length_free_are_refused() {
                 // A plane seen without turning may end at a minimum that is no lens.
                 let is_told = if planar { expected.iter().all(|code| codes.contains(code)) } else { codes == expected };
                 assert!(is_told, "{name}, {tracks} tracks, seed {seed}: {:?}", outcome.warnings);
-                let on_the_axis = outcome.warnings[0].detail.contains("optical axis");
-                assert_eq!(on_the_axis, motion == Motion::Forward, "{name}, seed {seed}: {:?}", outcome.warnings);
             }
         }
     }
