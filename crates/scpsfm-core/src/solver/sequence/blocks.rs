@@ -1,7 +1,5 @@
 //! The blocks that a reconstruction may begin with: they are searched, calibrated, and extended from there.
 
-use std::ops::ControlFlow;
-
 use super::ended::{Ended, finished, metric_of};
 use super::extended::{Extended, extend};
 use super::starts::extend_projectively;
@@ -11,6 +9,13 @@ use crate::solver::portfolio::Effort;
 use crate::solver::problem::Problem;
 use crate::solver::recorder::Recorder;
 use crate::solver::view_selection;
+
+/// What came of the blocks of an input.
+pub struct Tried {
+    pub ended: Ended,
+    /// Whether nothing else needs to be tried.
+    pub is_last: bool,
+}
 
 /// Sets of views that a reconstruction may begin with, best first.
 pub struct Blocks {
@@ -33,20 +38,15 @@ impl Blocks {
         !(self.is_whole && problem.input.has_depths())
     }
 
-    /// Calibrates the blocks and extends them from there; breaks where nothing else needs to be tried.
-    pub fn by_calibration(
-        &self,
-        problem: &Problem,
-        is_quick: bool,
-        recorder: &mut Recorder,
-    ) -> Result<ControlFlow<Ended, Ended>, Error> {
+    /// Calibrates the blocks and extends them from there.
+    pub fn by_calibration(&self, problem: &Problem, is_quick: bool, recorder: &mut Recorder) -> Result<Tried, Error> {
         let ended = if self.is_whole {
             let attempt = of_whole(problem, &self.sets[0], is_quick, recorder)?;
             // A second search, which tries everything, has the last word. With depths there is one only, and subsets
             // follow.
             let is_last = !is_quick && !problem.input.has_depths() && attempt.projective.is_some();
             if is_last || attempt.is_trusted() || attempt.is_beyond_image_points() {
-                return Ok(ControlFlow::Break(finished(problem, attempt, recorder)?));
+                return Ok(Tried { ended: finished(problem, attempt, recorder)?, is_last: true });
             }
             match attempt.is_calibrated() {
                 true => metric_of(problem, attempt, recorder)?,
@@ -55,8 +55,8 @@ impl Blocks {
         } else {
             by_calibrated_blocks(problem, &self.sets, Effort { is_seed: true, is_quick }, recorder)?
         };
-        let is_settled = matches!(&ended, Ended::Extended(extended) if extended.is_settled(problem));
-        Ok(if is_settled { ControlFlow::Break(ended) } else { ControlFlow::Continue(ended) })
+        let is_last = matches!(&ended, Ended::Extended(extended) if extended.is_settled(problem));
+        Ok(Tried { ended, is_last })
     }
 }
 

@@ -57,19 +57,11 @@ pub fn others(
             component += 1;
             recorder.begin_component(component);
             let priors = priors(problem, seed, model);
-            let (attempt, views) = match seed_views {
-                SeedViews::Block(views) => {
-                    (attempt::solve_block(problem, problem.block(&views), SEED, &priors, recorder)?, views)
-                }
-                SeedViews::Triplet(views) => {
-                    let mut attempt = pairs.attempt(&views, recorder)?;
-                    attempt::calibrate(problem, &mut attempt, &priors, recorder)?;
-                    (attempt, views.to_vec())
-                }
-            };
+            let mut attempt = pairs.search(&seed_views, SEED, recorder)?;
+            attempt::calibrate(problem, &mut attempt, &priors, recorder)?;
             recorder.end_component();
             // Whatever comes of it, it is tried once.
-            views.iter().for_each(|&view| open[view] = false);
+            attempt.block.views.iter().for_each(|&view| open[view] = false);
             let is_added = add(problem, model, component, &attempt, trials, recorder)?;
             failures = if is_added { 0 } else { failures + 1 };
             for (open, pose) in open.iter_mut().zip(&model.poses) {

@@ -55,43 +55,24 @@ const HOMOGRAPHY_UNKNOWNS: usize = 8;
 
 /// Whether an answer behind lenses replaces one without: it has a calibration, and explains nearly as much. That of a
 /// part is not to replace a reconstruction of the whole.
-fn replaces(behind: &Ended, of_pinholes: &Ended, problem: &Problem) -> bool {
+pub fn replaces(behind: &Ended, of_pinholes: &Ended, problem: &Problem) -> bool {
     behind.calibrated_extension(problem).is_some()
         && behind.evidence(problem) > OPTIONS.least_kept * of_pinholes.evidence(problem)
 }
 
-/// What came of an input behind lenses.
-pub struct BehindLenses {
-    pub ended: Ended,
-    undone: Option<Undone>,
-}
-
-impl BehindLenses {
-    /// As [`replaces`].
-    pub fn replaces(&self, of_pinholes: &Ended, problem: &Problem) -> bool {
-        replaces(&self.ended, of_pinholes, problem)
-    }
-
-    /// The answer, its lenses undone in the problem.
-    pub fn accept(self, problem: &mut Problem) -> Ended {
-        problem.undone = self.undone;
-        self.ended
-    }
-}
-
 /// Solves an input behind the lenses that explain seeds better than pinholes, and where that does not replace what
-/// pinholes gave, behind those that it calibrated; `None` where no lens explains seeds better, or most views. No lens
-/// is undone then.
+/// pinholes gave, behind those that it calibrated; `None` where no lens explains seeds better, or most views. The
+/// answer comes with its lenses, to be undone where it is accepted: none is undone in the problem then.
 pub fn solve_behind(
     problem: &mut Problem,
     of_pinholes: &Ended,
     recorder: &mut Recorder,
-) -> Result<Option<BehindLenses>, Error> {
+) -> Result<Option<(Ended, Option<Undone>)>, Error> {
     if !undo(problem, recorder)? {
         return Ok(None);
     }
     let quick = QuickPass::new(problem, recorder)?;
-    let found = quick.result();
+    let found = &quick.ended;
     // Seeds gain by a lens by chance, and the whole then explains no more: three translations had .99 to 1.00 of what
     // they had without, three scenes behind real lenses 1.14 to 1.33 times as much.
     let explains_more = found.evidence(problem) > of_pinholes.evidence(problem);
@@ -104,7 +85,7 @@ pub fn solve_behind(
     if calibrated.is_some_and(|extended| undo_calibrated(problem, extended)) {
         ended = QuickPass::new(problem, recorder)?.finish(problem, recorder)?;
     }
-    Ok(Some(BehindLenses { ended, undone: problem.undone.take() }))
+    Ok(Some((ended, problem.undone.take())))
 }
 
 /// Undoes the lenses that an extension calibrated, each in place of a sampled one; whether there is any. A sampled lens

@@ -44,7 +44,6 @@ pub use structure::widest_angle;
 use super::error::Error;
 use super::problem::Problem;
 use super::recorder::Recorder;
-use lens::BehindLenses;
 use quick_pass::QuickPass;
 
 /// Solves an input, and once more from a lower noise where structures may be mixed, see [`Ended::may_be_mixed`]: there
@@ -74,12 +73,13 @@ fn solve_from_noise(problem: &mut Problem, recorder: &mut Recorder) -> Result<En
     let quick = QuickPass::new(problem, recorder)?;
     let mut behind = None;
     // An extension to most views shows how much pinholes explain, which what else there is to try hardly changes.
-    let lenses_first = quick.result().asks_for_lens(problem) && quick.result().holds_most_views();
+    let lenses_first = quick.ended.asks_for_lens(problem) && quick.ended.holds_most_views();
     if lenses_first {
-        behind = lens::solve_behind(problem, quick.result(), recorder)?;
-        let replaces = |found: &BehindLenses| found.ended.holds_most_views() && found.replaces(quick.result(), problem);
-        if let Some(found) = behind.take_if(|found| replaces(found)) {
-            return Ok(found.accept(problem));
+        behind = lens::solve_behind(problem, &quick.ended, recorder)?;
+        let replaces = |found: &Ended| found.holds_most_views() && lens::replaces(found, &quick.ended, problem);
+        if let Some((found, undone)) = behind.take_if(|(found, _)| replaces(found)) {
+            problem.undone = undone;
+            return Ok(found);
         }
         recorder.begin_again();
     }
@@ -90,8 +90,9 @@ fn solve_from_noise(problem: &mut Problem, recorder: &mut Recorder) -> Result<En
     if !lenses_first {
         behind = lens::solve_behind(problem, &ended, recorder)?;
     }
-    match behind.filter(|found| found.replaces(&ended, problem)) {
-        Some(found) => Ok(found.accept(problem)),
-        None => Ok(ended),
-    }
+    let Some((found, undone)) = behind.filter(|(found, _)| lens::replaces(found, &ended, problem)) else {
+        return Ok(ended);
+    };
+    problem.undone = undone;
+    Ok(found)
 }

@@ -1,8 +1,6 @@
 //! In which order seeds are tried: what is cheap first.
 
-use std::ops::ControlFlow;
-
-use super::blocks::Blocks;
+use super::blocks::{Blocks, Tried};
 use super::ended::{Ended, attempt_worth, metric_of};
 use super::options::ExtensionOptions;
 use super::starts::{QUICK_SEED, Start, by_projective_extension, extend_projectively, stands, starts};
@@ -19,21 +17,16 @@ use crate::solver::{near_duplicates, view_selection};
 /// The blocks of an input, and what their first search, calibration and metric extension came to.
 pub struct QuickPass {
     blocks: Blocks,
-    /// Breaks where nothing else needs to be tried.
-    result: ControlFlow<Ended, Ended>,
+    pub ended: Ended,
+    /// Whether nothing else needs to be tried.
+    is_last: bool,
 }
 
 impl QuickPass {
     pub fn new(problem: &Problem, recorder: &mut Recorder) -> Result<Self, Error> {
         let blocks = Blocks::of(problem);
-        let result = blocks.by_calibration(problem, blocks.begin_quickly(problem), recorder)?;
-        Ok(Self { blocks, result })
-    }
-
-    pub fn result(&self) -> &Ended {
-        match &self.result {
-            ControlFlow::Break(ended) | ControlFlow::Continue(ended) => ended,
-        }
+        let Tried { ended, is_last } = blocks.by_calibration(problem, blocks.begin_quickly(problem), recorder)?;
+        Ok(Self { blocks, ended, is_last })
     }
 
     /// What else is tried where the quick pass has neither a calibration nor a precise reconstruction of most views. A
@@ -44,13 +37,15 @@ impl QuickPass {
     /// stands: the blocks again, with everything that a search can try, and the subsets that are left. An input whose
     /// tracks are mostly complete is its only block; with depths it is searched at length at once.
     pub fn finish(self, problem: &Problem, recorder: &mut Recorder) -> Result<Ended, Error> {
-        let Self { blocks, result } = self;
+        let Self { blocks, ended, is_last } = self;
+        if is_last {
+            return Ok(ended);
+        }
         let is_quick = blocks.begin_quickly(problem);
         // A calibration of few views, than which another answer may be worth more.
-        let (part, first) = match result {
-            ControlFlow::Break(ended) => return Ok(ended),
-            ControlFlow::Continue(ended) if ended.calibrated_extension(problem).is_some() => (Some(ended), None),
-            ControlFlow::Continue(ended) => (None, ended.seed()),
+        let (part, first) = match ended.calibrated_extension(problem).is_some() {
+            true => (Some(ended), None),
+            false => (None, ended.seed()),
         };
         let subsets = view_selection::subsets(&blocks.sets);
         let is_short = blocks.is_whole || part.is_some();
@@ -66,12 +61,11 @@ impl QuickPass {
             best = by_projective_extension(problem, best, starts, recorder)?;
         }
         if is_quick && part.is_none() && !stands(&best) {
-            let first = match blocks.by_calibration(problem, false, recorder)? {
-                ControlFlow::Break(ended) => return Ok(ended),
-                ControlFlow::Continue(ended) if ended.calibrated_extension(problem).is_some() => return Ok(ended),
-                ControlFlow::Continue(ended) => ended.seed(),
-            };
-            best = by_projective_extension(problem, None, starts(first, false, rest), recorder)?;
+            let Tried { ended, is_last } = blocks.by_calibration(problem, false, recorder)?;
+            if is_last || ended.calibrated_extension(problem).is_some() {
+                return Ok(ended);
+            }
+            best = by_projective_extension(problem, None, starts(ended.seed(), false, rest), recorder)?;
         }
         let part_worth = part.as_ref().map_or(f64::NEG_INFINITY, |part| part.worth(problem));
         let found = best.filter(|best| attempt_worth(best, problem) > part_worth);

@@ -51,13 +51,7 @@ pub fn by_projective_extension(
             Start::Found { attempt, keeps } => (*attempt, keeps),
             Start::Views(views) => {
                 recorder.begin_block(k, count);
-                let attempt = match views {
-                    SeedViews::Block(views) => {
-                        attempt::search_block(problem, problem.block(&views), QUICK_SEED, recorder)?
-                    }
-                    SeedViews::Triplet(views) => pairs.attempt(&views, recorder)?,
-                };
-                (attempt, false)
+                (pairs.search(&views, QUICK_SEED, recorder)?, false)
             }
         };
         extend_projectively(problem, &mut attempt, keeps, recorder)?;

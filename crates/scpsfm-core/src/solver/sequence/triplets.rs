@@ -18,12 +18,13 @@ use crate::geometry::statistics::ln_choose;
 use crate::geometry::three_views::{self, FundamentalMatrices};
 use crate::geometry::{Camera, triangulation};
 use crate::solver::a_contrario::FalseAlarmOptions;
-use crate::solver::attempt::Attempt;
+use crate::solver::attempt::{self, Attempt};
 use crate::solver::error::Error;
+use crate::solver::portfolio::Effort;
 use crate::solver::problem::Problem;
 use crate::solver::projective::ProjectiveReconstruction;
 use crate::solver::recorder::Recorder;
-use crate::solver::view_selection::evenly;
+use crate::solver::view_selection::{SeedViews, evenly};
 
 const OPTIONS: TripletOptions = TripletOptions::DEFAULT;
 
@@ -46,6 +47,16 @@ struct Pair {
 impl<'a> Pairs<'a> {
     pub fn new(problem: &'a Problem<'a>) -> Self {
         Self { problem, known: BTreeMap::new() }
+    }
+
+    /// What is found of these views.
+    ///
+    /// * `effort`: that a block is searched with
+    pub fn search(&mut self, views: &SeedViews, effort: Effort, recorder: &mut Recorder) -> Result<Attempt, Error> {
+        match views {
+            SeedViews::Block(views) => attempt::search_block(self.problem, self.problem.block(views), effort, recorder),
+            SeedViews::Triplet(views) => self.attempt(views, recorder),
+        }
     }
 
     /// What is found of a triplet.
