@@ -16,9 +16,6 @@ pub trait Growth {
     /// Whether a view may be added.
     fn is_open(&self, view: usize) -> bool;
 
-    /// How many observations of a view may support its registration, at most.
-    fn support(&self, view: usize) -> usize;
-
     /// The observations of a view whose points may support its registration.
     fn supporting(&self, view: usize) -> Vec<usize>;
 
@@ -75,19 +72,14 @@ pub fn grow(
 /// The view to try next, the one that sees most points, with these observations; one that failed is tried again once it
 /// sees more.
 fn next(growth: &impl Growth, options: &GrowthOptions, trials: &[Trial]) -> Option<(usize, Vec<usize>)> {
-    let is_worth = |view: usize, seen: usize| {
-        let trial = &trials[view];
-        let sees_more = trial.count == 0 || seen as f64 >= options.retry_growth * trial.seen as f64;
-        seen >= options.least_agreeing && trial.count < options.most_trials && sees_more
+    let is_worth = |(view, seen): &(usize, Vec<usize>)| {
+        let trial = &trials[*view];
+        let sees_more = trial.count == 0 || seen.len() as f64 >= options.retry_growth * trial.seen as f64;
+        seen.len() >= options.least_agreeing && trial.count < options.most_trials && sees_more
     };
-    let open = (0..trials.len()).filter(|&view| growth.is_open(view)).map(|view| (growth.support(view), view));
-    let mut open: Vec<(usize, usize)> = open.filter(|&(support, view)| is_worth(view, support)).collect();
+    let open = (0..trials.len()).filter(|&view| growth.is_open(view)).map(|view| (view, growth.supporting(view)));
     // The first of equals, so that one input has one answer.
-    open.sort_by_key(|&(support, view)| (Reverse(support), view));
-    open.into_iter().find_map(|(_, view)| {
-        let seen = growth.supporting(view);
-        is_worth(view, seen.len()).then_some((view, seen))
-    })
+    open.filter(is_worth).min_by_key(|(view, seen)| (Reverse(seen.len()), *view))
 }
 
 /// The tracks with most support until every view has as many kept observations as wanted, or all that it has;

@@ -44,7 +44,7 @@ pub fn merge(problem: &Problem, model: &mut Model, component: u32, recorder: &mu
         Some((into, from, similarity(problem, model, into, from)?))
     })?;
     let views = model.of_component(from);
-    model.merge(problem, from, into, &similarity);
+    model.merge(from, into, &similarity);
     structure::triangulate_seen(problem, model, &views, recorder);
     Some(into)
 }

@@ -60,10 +60,6 @@ pub struct Model {
     pub landmarks: Vec<Option<Landmark>>,
     /// One an observation: whether it agrees with its landmark.
     pub kept: Vec<bool>,
-    /// The component that grows.
-    current: u32,
-    /// Landmarks of that component among the tracks of each view that may support a pose.
-    pub supported: Vec<usize>,
     /// Core noise, one standard deviation of a coordinate, normalised units.
     pub noise: f64,
     /// Noise of the seed, whose gates found it.
@@ -90,8 +86,6 @@ impl Model {
             component_of: vec![0; views],
             landmarks: vec![None; problem.tracks()],
             kept: vec![false; problem.xy.len()],
-            current: 0,
-            supported: vec![0; views],
             noise,
             seed_noise: noise,
             is_strained: false,
@@ -107,32 +101,6 @@ impl Model {
         if noise.is_finite() {
             self.is_strained = noise > most;
             self.noise = noise.clamp(least, most);
-        }
-    }
-
-    /// Turns to the component that grows next.
-    pub fn turn_to(&mut self, problem: &Problem, component: u32) {
-        self.current = component;
-        self.supported.fill(0);
-        for track in 0..self.landmarks.len() {
-            self.count_support(problem, track, 1);
-        }
-    }
-
-    /// Sets the landmark of a track.
-    pub fn set_landmark(&mut self, problem: &Problem, track: usize, landmark: Option<Landmark>) {
-        self.count_support(problem, track, -1);
-        self.landmarks[track] = landmark;
-        self.count_support(problem, track, 1);
-    }
-
-    fn count_support(&mut self, problem: &Problem, track: usize, by: isize) {
-        let counts = |landmark: &Landmark| landmark.component == self.current && landmark.supports();
-        if self.landmarks[track].as_ref().is_some_and(counts) {
-            for k in problem.of_track(track) {
-                let count = &mut self.supported[problem.view_of(k)];
-                *count = count.saturating_add_signed(by);
-            }
         }
     }
 
@@ -190,10 +158,10 @@ impl Model {
         components
     }
 
-    /// Takes a component into the frame of another one, and turns to that.
+    /// Takes a component into the frame of another one.
     ///
     /// * `similarity`: from the frame of the one to that of the other
-    pub fn merge(&mut self, problem: &Problem, from: u32, into: u32, similarity: &Similarity) {
+    pub fn merge(&mut self, from: u32, into: u32, similarity: &Similarity) {
         for view in self.of_component(from) {
             self.poses[view] = self.poses[view].map(|pose| similarity.pose(&pose));
             self.component_of[view] = into;
@@ -202,7 +170,6 @@ impl Model {
             landmark.position = similarity.apply(&landmark.position);
             landmark.component = into;
         }
-        self.turn_to(problem, into);
     }
 
     /// Takes views back.

@@ -255,10 +255,6 @@ impl Growth for Growing<'_> {
         self.cameras[view].is_none()
     }
 
-    fn support(&self, view: usize) -> usize {
-        self.points_for(view).count()
-    }
-
     fn supporting(&self, view: usize) -> Vec<usize> {
         self.points_for(view).collect()
     }

@@ -60,7 +60,6 @@ pub fn join_again(
 
 impl<'a> Component<'a> {
     fn new(problem: &'a Problem<'a>, model: &'a mut Model, component: u32, options: &'a GrowthOptions) -> Self {
-        model.turn_to(problem, component);
         Self { problem, model, component, options, rng: ChaCha8Rng::seed_from_u64(problem.settings.seed) }
     }
 }
@@ -86,14 +85,11 @@ impl Growth for Component<'_> {
     fn is_open(&self, view: usize) -> bool {
         let Self { problem, model, component, options, .. } = self;
         let Some(_) = model.poses[view] else { return true };
-        let seen = model.supported[view];
-        model.component_of[view] != *component
-            && seen >= options.least_agreeing
-            && seen > options.moving_ratio * model.held_by(problem, view)
-    }
-
-    fn support(&self, view: usize) -> usize {
-        self.model.supported[view]
+        if model.component_of[view] == *component {
+            return false;
+        }
+        let seen = self.supporting(view).len();
+        seen >= options.least_agreeing && seen > options.moving_ratio * model.held_by(problem, view)
     }
 
     fn supporting(&self, view: usize) -> Vec<usize> {

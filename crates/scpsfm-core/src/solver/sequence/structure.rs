@@ -39,7 +39,7 @@ fn triangulate_some(problem: &Problem, model: &mut Model, tracks: &[usize], reco
     each_track(problem, tracks, model, recorder, find, |model, track, found| {
         forget(problem, model, track);
         if let Some((landmark, agreeing)) = found {
-            model.set_landmark(problem, track, Some(landmark));
+            model.landmarks[track] = Some(landmark);
             agreeing.into_iter().for_each(|k| model.kept[k] = true);
         }
     });
@@ -78,7 +78,7 @@ fn landmark(
 
 /// Takes the point of a track away.
 fn forget(problem: &Problem, model: &mut Model, track: usize) {
-    model.set_landmark(problem, track, None);
+    model.landmarks[track] = None;
     problem.of_track(track).for_each(|k| model.kept[k] = false);
 }
 
