@@ -7,7 +7,7 @@
 use nalgebra::{SVector, Vector2};
 
 use super::Observation;
-use super::problem::{BundleProblem, Jacobian, Layout, ResidualVisitor, Step};
+use super::problem::{BundleProblem, Jacobian, Layout, Step};
 
 /// Share of the unknowns of the cameras that those of the points may have at most: with as many of either, a camera's
 /// larger blocks cost more to eliminate.
@@ -27,30 +27,17 @@ pub(super) fn is_worth_it<const C: usize, const P: usize>(problem: &impl BundleP
 
 /// The layout of the problem with cameras and points exchanged.
 pub(super) fn layout(layout: &Layout, cameras: usize) -> Layout {
-    let observations: Vec<Observation> = layout.observations.iter().map(exchanged).collect();
+    let observations: Vec<Observation> = layout.observations.iter().copied().map(exchanged).collect();
     Layout::new(&observations, layout.starts.len() - 1, cameras)
 }
 
-fn exchanged(seen: &Observation) -> Observation {
-    Observation { view: seen.point, point: seen.view, ..*seen }
+fn exchanged(seen: Observation) -> Observation {
+    Observation { view: seen.point, point: seen.view, ..seen }
 }
 
 /// A problem with cameras and points exchanged.
 #[derive(Clone)]
 pub(super) struct CameraElimination<T>(pub T);
-
-/// Hands on what a problem says, cameras and points exchanged.
-struct Exchanging<'a, S>(&'a mut S);
-
-impl<const C: usize, const P: usize, S: ResidualVisitor<P, C>> ResidualVisitor<C, P> for Exchanging<'_, S> {
-    #[inline]
-    fn visit(&mut self, residual: Vector2<f64>, jacobian: impl FnOnce() -> Jacobian<C, P>) {
-        self.0.visit(residual, || {
-            let Jacobian { camera, point } = jacobian();
-            Jacobian { camera: point, point: camera }
-        });
-    }
-}
 
 impl<const C: usize, const P: usize, T: BundleProblem<C, P>> BundleProblem<P, C> for CameraElimination<T> {
     fn counts(&self) -> (usize, usize) {
@@ -59,8 +46,13 @@ impl<const C: usize, const P: usize, T: BundleProblem<C, P>> BundleProblem<P, C>
     }
 
     #[inline]
-    fn evaluate(&self, observation: &Observation, visitor: &mut impl ResidualVisitor<P, C>) {
-        self.0.evaluate(&exchanged(observation), &mut Exchanging(visitor));
+    fn evaluate(&self, seen: Observation) -> (Vector2<f64>, impl FnOnce() -> Jacobian<P, C>) {
+        let (residual, jacobian) = self.0.evaluate(exchanged(seen));
+        let exchanged_jacobian = || {
+            let Jacobian { camera, point } = jacobian();
+            Jacobian { camera: point, point: camera }
+        };
+        (residual, exchanged_jacobian)
     }
 
     fn retract(&mut self, from: &Self, step: &Step<P, C>) {

@@ -9,7 +9,7 @@ use nalgebra::{Matrix3, SMatrix, SVector, Vector2, Vector3};
 use super::Observation;
 pub(crate) use super::engine::minimise;
 pub(crate) use super::problem::BundleProblem;
-use super::problem::{Jacobian, ResidualVisitor, Step, image, move_each, unit_norm};
+use super::problem::{Jacobian, Step, image, move_each, unit_norm};
 
 /// Views of a plane, or of anything from one centre: `x ~ H (x, y, 1)`.
 #[derive(Debug, Clone)]
@@ -38,11 +38,12 @@ impl BundleProblem<9, 2> for Homographies {
         (self.views.len(), self.points.len())
     }
 
-    fn evaluate(&self, observation: &Observation, visitor: &mut impl ResidualVisitor<9, 2>) {
-        let homography = &self.views[observation.view];
-        let point = self.points[observation.point].push(1.0);
+    #[inline]
+    fn evaluate(&self, seen: Observation) -> (Vector2<f64>, impl FnOnce() -> Jacobian<9, 2>) {
+        let homography = &self.views[seen.view];
+        let point = self.points[seen.point].push(1.0);
         let (image, by_seen) = image(&(homography * point));
-        visitor.visit(image - observation.xy, || {
+        let jacobian = move || {
             let mut jacobian = Jacobian::<9, 2>::zeros();
             for (component, by_seen) in by_seen.iter().enumerate() {
                 let by_entry = SMatrix::<f64, 9, 1>::from_fn(|k, _| by_seen[k / 3] * point[k % 3]);
@@ -50,7 +51,8 @@ impl BundleProblem<9, 2> for Homographies {
                 jacobian.point.set_column(component, &homography.tr_mul(by_seen).xy());
             }
             jacobian
-        });
+        };
+        (image - seen.xy, jacobian)
     }
 
     fn retract(&mut self, from: &Self, step: &Step<9, 2>) {
@@ -70,18 +72,20 @@ impl BundleProblem<3, 3> for Translating {
         (self.translations.len(), self.points.len())
     }
 
-    fn evaluate(&self, observation: &Observation, visitor: &mut impl ResidualVisitor<3, 3>) {
-        let translation = &self.translations[observation.view];
-        let point = &self.points[observation.point];
+    #[inline]
+    fn evaluate(&self, seen: Observation) -> (Vector2<f64>, impl FnOnce() -> Jacobian<3, 3>) {
+        let translation = &self.translations[seen.view];
+        let point = &self.points[seen.point];
         let (image, by_seen) = image(&(point.xy().push(1.0) + translation * point.z));
-        visitor.visit(image - observation.xy, || {
+        let jacobian = move || {
             let mut jacobian = Jacobian::<3, 3>::zeros();
             for (component, by_seen) in by_seen.iter().enumerate() {
                 jacobian.camera.set_column(component, &(by_seen * point.z));
                 jacobian.point.set_column(component, &by_seen.xy().push(by_seen.dot(translation)));
             }
             jacobian
-        });
+        };
+        (image - seen.xy, jacobian)
     }
 
     fn retract(&mut self, from: &Self, step: &Step<3, 3>) {

@@ -2,37 +2,21 @@
 
 use std::marker::PhantomData;
 
-use nalgebra::Vector2;
-
 use super::camera_elimination::{self, CameraElimination};
-use super::problem::{BundleProblem, Jacobian, Layout, ResidualVisitor, UNDEFINED_SQUARED, usable_squared_norm};
+use super::problem::{BundleProblem, Layout, UNDEFINED_SQUARED, usable_squared_norm};
 use super::reduced::{Linearisation, Reduced};
 use super::{Loss, Observation, Options, Report};
 use crate::domain::StopToken;
 use crate::geometry::levenberg_marquardt::{self, MIN_DAMPING};
 
-/// Sums the loss.
-struct Cost {
-    loss: Loss,
-    /// Of the observation.
-    weight: f64,
-    sum: f64,
-}
-
-impl<const C: usize, const P: usize> ResidualVisitor<C, P> for Cost {
-    #[inline]
-    fn visit(&mut self, residual: Vector2<f64>, _jacobian: impl FnOnce() -> Jacobian<C, P>) {
-        self.sum += self.loss.cost(self.weight * usable_squared_norm(&residual).unwrap_or(UNDEFINED_SQUARED));
-    }
-}
-
+/// Sum of the loss over the observations.
 fn cost<const C: usize, const P: usize>(problem: &impl BundleProblem<C, P>, layout: &Layout, loss: Loss) -> f64 {
-    let mut total = Cost { loss, weight: 1.0, sum: 0.0 };
+    let mut sum = 0.0;
     for seen in &layout.observations {
-        total.weight = seen.weight;
-        problem.evaluate(seen, &mut total);
+        let (residual, _) = problem.evaluate(*seen);
+        sum += loss.cost(seen.weight * usable_squared_norm(&residual).unwrap_or(UNDEFINED_SQUARED));
     }
-    total.sum
+    sum
 }
 
 /// Minimises the loss over all unknowns, starting from and ending in `problem`.

@@ -15,14 +15,6 @@ pub(crate) struct Jacobian<const C: usize, const P: usize> {
     pub point: SMatrix<f64, P, 2>,
 }
 
-/// Takes residuals (predicted minus observed) and, if it wants them, their derivatives.
-///
-/// A problem writes residual and Jacobian once; the cost, the normal equations and the test by finite differences
-/// are visitors of the same code.
-pub(crate) trait ResidualVisitor<const C: usize, const P: usize> {
-    fn visit(&mut self, residual: Vector2<f64>, jacobian: impl FnOnce() -> Jacobian<C, P>);
-}
-
 /// A change of the unknowns in the tangent space.
 #[derive(Debug, Clone)]
 pub(crate) struct Step<const C: usize, const P: usize> {
@@ -45,8 +37,8 @@ impl<const C: usize, const P: usize> Step<C, P> {
 pub(crate) trait BundleProblem<const C: usize, const P: usize>: Clone {
     /// How many cameras and points there are.
     fn counts(&self) -> (usize, usize);
-    /// Hands the residual of one observation, and its Jacobian on demand, to `visitor`.
-    fn evaluate(&self, observation: &Observation, visitor: &mut impl ResidualVisitor<C, P>);
+    /// The residual of one observation, predicted minus observed, and what calculates its Jacobian.
+    fn evaluate(&self, seen: Observation) -> (Vector2<f64>, impl FnOnce() -> Jacobian<C, P>);
     /// Overwrites `self` with `from` moved by `step`; both have the same counts.
     fn retract(&mut self, from: &Self, step: &Step<C, P>);
     /// Direction in which a homogeneous camera moves without changing any residual; zero where there is none.

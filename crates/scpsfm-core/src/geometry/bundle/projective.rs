@@ -1,10 +1,10 @@
 //! Projective bundle adjustment: free 3x4 cameras and homogeneous points.
 
-use nalgebra::{Matrix3x4, SVector, Vector4};
+use nalgebra::{Matrix3x4, SVector, Vector2, Vector4};
 
 use super::engine::minimise;
 
-use super::problem::{BundleProblem, Jacobian, ResidualVisitor, Step, image, move_each, unit_norm};
+use super::problem::{BundleProblem, Jacobian, Step, image, move_each, unit_norm};
 use super::{Observation, Options, Report};
 use crate::domain::StopToken;
 
@@ -24,11 +24,11 @@ impl BundleProblem<CAMERA, POINT> for Projective {
     }
 
     #[inline]
-    fn evaluate(&self, observation: &Observation, visitor: &mut impl ResidualVisitor<CAMERA, POINT>) {
-        let camera = &self.cameras[observation.view];
-        let point = &self.points[observation.point];
+    fn evaluate(&self, seen: Observation) -> (Vector2<f64>, impl FnOnce() -> Jacobian<CAMERA, POINT>) {
+        let camera = &self.cameras[seen.view];
+        let point = &self.points[seen.point];
         let (image, by_seen) = image(&(camera * point));
-        visitor.visit(image - observation.xy, || {
+        let jacobian = move || {
             let mut jacobian = Jacobian::<CAMERA, POINT>::zeros();
             for (component, by_seen) in by_seen.iter().enumerate() {
                 for row in 0..3 {
@@ -39,7 +39,8 @@ impl BundleProblem<CAMERA, POINT> for Projective {
                 jacobian.point.set_column(component, &camera.tr_mul(by_seen));
             }
             jacobian
-        });
+        };
+        (image - seen.xy, jacobian)
     }
 
     fn retract(&mut self, from: &Self, step: &Step<CAMERA, POINT>) {

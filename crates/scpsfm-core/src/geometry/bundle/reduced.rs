@@ -9,7 +9,7 @@ use nalgebra::{Cholesky, Matrix2, SMatrix, SVector, Vector2};
 
 use super::cholesky::CholeskySolver;
 use super::panel::Panel;
-use super::problem::{BundleProblem, Jacobian, Layout, ResidualVisitor, Step, usable_squared_norm};
+use super::problem::{BundleProblem, Jacobian, Layout, Step, usable_squared_norm};
 use super::{Loss, Observation};
 use crate::simd::vectorised;
 
@@ -26,36 +26,6 @@ pub(super) struct Linearisation<'a, const C: usize, const P: usize> {
     jacobians: Vec<Jacobian<C, P>>,
     camera_diagonals: Vec<SVector<f64, C>>,
     point_blocks: Vec<SMatrix<f64, P, P>>,
-}
-
-/// Writes one observation's weighted residual and Jacobian in place; an undefined one becomes zero.
-struct Entry<'a, const C: usize, const P: usize> {
-    loss: Loss,
-    /// Of the observation.
-    weight: f64,
-    residual: &'a mut Vector2<f64>,
-    jacobian: &'a mut Jacobian<C, P>,
-}
-
-impl<const C: usize, const P: usize> ResidualVisitor<C, P> for Entry<'_, C, P> {
-    #[inline]
-    fn visit(&mut self, residual: Vector2<f64>, jacobian: impl FnOnce() -> Jacobian<C, P>) {
-        match usable_squared_norm(&residual) {
-            Some(squared) => {
-                let weight = self.weight.sqrt() * self.loss.root_weight(self.weight * squared);
-                *self.residual = residual * weight;
-                *self.jacobian = jacobian();
-                if weight != 1.0 {
-                    self.jacobian.camera *= weight;
-                    self.jacobian.point *= weight;
-                }
-            }
-            None => {
-                *self.residual = Vector2::zeros();
-                *self.jacobian = Jacobian::zeros();
-            }
-        }
-    }
 }
 
 impl<const C: usize, const P: usize> Jacobian<C, P> {
@@ -76,13 +46,26 @@ impl<'a, const C: usize, const P: usize> Linearisation<'a, C, P> {
         }
     }
 
-    /// Linearises at the state of `problem`.
+    /// Linearises at the state of `problem`; an undefined observation gets a residual and a Jacobian of zero.
     pub fn fill(&mut self, problem: &impl BundleProblem<C, P>, loss: Loss) {
         self.camera_diagonals.fill(SVector::zeros());
         self.point_blocks.fill(SMatrix::zeros());
         for (k, seen) in self.layout.observations.iter().enumerate() {
             let (residual, jacobian) = (&mut self.residuals[k], &mut self.jacobians[k]);
-            problem.evaluate(seen, &mut Entry { loss, weight: seen.weight, residual, jacobian });
+            let (unweighted, derivatives) = problem.evaluate(*seen);
+            match usable_squared_norm(&unweighted) {
+                Some(squared) => {
+                    let weight = seen.weight.sqrt() * loss.root_weight(seen.weight * squared);
+                    *residual = unweighted * weight;
+                    *jacobian = derivatives();
+                    jacobian.camera *= weight;
+                    jacobian.point *= weight;
+                }
+                None => {
+                    *residual = Vector2::zeros();
+                    *jacobian = Jacobian::zeros();
+                }
+            }
             for component in 0..2 {
                 let camera = jacobian.camera.column(component);
                 self.camera_diagonals[seen.view] += camera.component_mul(&camera);

@@ -6,7 +6,7 @@ use rand_chacha::ChaCha8Rng;
 
 use super::Observation;
 use super::metric::{Intrinsics, MetricReconstruction, Pose};
-use super::problem::{BundleProblem, Jacobian, ResidualVisitor, Step};
+use super::problem::{BundleProblem, Step};
 use crate::synthetic::{Scene, SceneOptions};
 
 /// Noise of the tests, one standard deviation as a share of the image: the paper's .3 %.
@@ -192,28 +192,6 @@ pub(super) fn perturbed(truth: &MetricReconstruction, deviation: f64, seed: u64)
     start
 }
 
-/// Keeps the last residual and Jacobian: what the solver would have accumulated.
-struct Last<const C: usize, const P: usize> {
-    residual: Vector2<f64>,
-    jacobian: Option<Jacobian<C, P>>,
-}
-
-impl<const C: usize, const P: usize> ResidualVisitor<C, P> for Last<C, P> {
-    fn visit(&mut self, residual: Vector2<f64>, jacobian: impl FnOnce() -> Jacobian<C, P>) {
-        self.residual = residual;
-        self.jacobian = Some(jacobian());
-    }
-}
-
-fn at<const C: usize, const P: usize>(
-    problem: &impl BundleProblem<C, P>,
-    seen: &Observation,
-) -> (Vector2<f64>, Jacobian<C, P>) {
-    let mut last = Last { residual: Vector2::zeros(), jacobian: None };
-    problem.evaluate(seen, &mut last);
-    (last.residual, last.jacobian.expect("the problem hands over a Jacobian"))
-}
-
 /// Compares the Jacobian of every observation with central differences through the problem's own retraction.
 ///
 /// # Panics
@@ -229,14 +207,16 @@ pub(super) fn check_jacobian<const C: usize, const P: usize>(
     let (cameras, points) = problem.counts();
     let mut compared = 0;
     for seen in observations {
-        let (_, jacobian) = at(problem, seen);
+        let (_, jacobian) = problem.evaluate(*seen);
+        let jacobian = jacobian();
         let largest = jacobian.camera.amax().max(jacobian.point.amax()).max(1.0);
         let mut difference = |set: &dyn Fn(&mut Step<C, P>, f64)| {
             let mut side = |width: f64| {
                 let mut step = Step::zeros(cameras, points);
                 set(&mut step, width);
                 moved.retract(problem, &step);
-                at(&moved, seen).0
+                let (residual, _) = moved.evaluate(*seen);
+                residual
             };
             (side(WIDTH) - side(-WIDTH)) / (2.0 * WIDTH)
         };
