@@ -159,7 +159,7 @@ impl<'a> World<'a> {
         let options = Options {
             max_iterations: ADJUSTMENT_ITERATIONS,
             relative_tolerance: ADJUSTMENT_TOLERANCE,
-            ..Options::default()
+            ..Options::DEFAULT
         };
         sequence::adjust_all(
             &mut found,

@@ -19,12 +19,14 @@ const GROWTH_UP: f64 = 2.0;
 const ACCEPTED_FACTORS: (f64, f64) = (0.2, 2.0);
 /// Accepted steps over which the pace of a descent is measured: as many as rank the starts of a calibration.
 const PACE_STEPS: usize = 12;
-/// Least damping of dense problems: below it, rounding in the gauge directions would be amplified into the step.
-pub(crate) const MIN_DAMPING: f64 = 1e-10;
 
 /// What the loop asks of a sum of squares, or of a robust loss that is reweighted at every linearisation.
 pub(crate) trait LeastSquares {
     type State: Clone;
+
+    /// Least damping, relative to the diagonal: below that of dense problems, rounding in the gauge directions would be
+    /// amplified into the step.
+    const MIN_DAMPING: f64 = 1e-10;
 
     /// The cost of a state; infinite or not a number where it has none.
     fn cost(&self, state: &Self::State) -> f64;
@@ -53,20 +55,66 @@ pub(crate) struct StepCost {
     pub predicted: f64,
 }
 
-/// When to start and end.
+/// What a residual costs, as a function of its norm `r` in normalised image units.
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub(crate) struct Options {
+pub enum Loss {
+    /// `r^2`
+    Squared,
+    /// `s^2 ln(1 + r^2 / s^2)` with `s` the scale; iteratively reweighted.
+    Cauchy { scale: f64 },
+}
+
+impl Loss {
+    /// Cost of a residual of this squared norm.
+    #[inline]
+    pub fn cost(self, squared: f64) -> f64 {
+        match self {
+            Loss::Squared => squared,
+            Loss::Cauchy { scale } => scale * scale * (squared / (scale * scale)).ln_1p(),
+        }
+    }
+
+    /// Factor on residual and Jacobian that makes least squares follow the loss: the root of its derivative.
+    #[inline]
+    pub fn root_weight(self, squared: f64) -> f64 {
+        match self {
+            Loss::Squared => 1.0,
+            Loss::Cauchy { scale } => (1.0 + squared / (scale * scale)).sqrt().recip(),
+        }
+    }
+}
+
+/// When to start and end, and what residuals cost.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Options {
     /// Accepted steps at most.
     pub max_iterations: usize,
     /// Ends when a step lowers the cost by less than this share of it.
     pub relative_tolerance: f64,
     /// First damping, relative to the diagonal of the normal equations.
     pub initial_damping: f64,
-    /// Least damping, see [`MIN_DAMPING`].
-    pub min_damping: f64,
     /// Ends as hopeless where the steps that are left, at the pace of the last [`PACE_STEPS`], do not bring the cost
     /// below this; infinite: never.
     pub hopeless_above: f64,
+    /// Of the residuals of a bundle adjustment; other problems have a loss of their own.
+    pub loss: Loss,
+}
+
+impl Options {
+    /// Converges from an algebraic solution: 30 steps are rarely used up, and a cost that moves by less than 1e-7 is
+    /// far below the noise it is compared with.
+    pub const DEFAULT: Self = Self {
+        max_iterations: 30,
+        relative_tolerance: 1e-7,
+        initial_damping: 1e-4,
+        hopeless_above: f64::INFINITY,
+        loss: Loss::Squared,
+    };
+
+    /// Plain least squares with these iterations.
+    pub fn squared(max_iterations: usize) -> Self {
+        Self { max_iterations, ..Self::DEFAULT }
+    }
 }
 
 /// What the loop did.
@@ -101,7 +149,7 @@ pub(crate) fn minimise<P: LeastSquares>(
     // After the last steps, each at its number modulo theirs.
     let mut costs = [report.cost; PACE_STEPS];
     let mut trial = state.clone();
-    let mut damping = options.initial_damping.max(options.min_damping);
+    let mut damping = options.initial_damping.max(P::MIN_DAMPING);
     while report.iterations < options.max_iterations && report.cost > 0.0 && !stop.is_stopped() {
         problem.linearise(state);
         let mut growth = DAMPING_UP;
@@ -118,7 +166,7 @@ pub(crate) fn minimise<P: LeastSquares>(
         let Some(StepCost { cost, predicted }) = accepted else { break };
         std::mem::swap(state, &mut trial);
         let gain = report.cost - cost;
-        damping = (damping * factor_after(gain / predicted)).max(options.min_damping);
+        damping = (damping * factor_after(gain / predicted)).max(P::MIN_DAMPING);
         report.cost = cost;
         report.iterations += 1;
         let before = std::mem::replace(&mut costs[report.iterations % PACE_STEPS], cost);
@@ -225,13 +273,8 @@ mod tests {
         }
     }
 
-    const OPTIONS: Options = Options {
-        max_iterations: 100,
-        relative_tolerance: 1e-12,
-        initial_damping: 1e-3,
-        min_damping: MIN_DAMPING,
-        hopeless_above: f64::INFINITY,
-    };
+    const OPTIONS: Options =
+        Options { max_iterations: 100, relative_tolerance: 1e-12, initial_damping: 1e-3, ..Options::DEFAULT };
 
     #[test]
     fn the_minimum_of_a_curved_valley_is_found() {

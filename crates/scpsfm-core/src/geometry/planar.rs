@@ -9,7 +9,7 @@ use nalgebra::{DMatrix, DVector, Matrix3, Rotation3, Vector2, Vector3};
 use super::bundle::critical::Homographies;
 use super::bundle::metric::{Intrinsics, MetricReconstruction, Pose};
 use super::daq::scan_focal;
-use super::levenberg_marquardt::{self, LeastSquares, MIN_DAMPING, damped_step};
+use super::levenberg_marquardt::{self, LeastSquares, Options, damped_step};
 use super::metric::oriented;
 use super::observation::Observation;
 use super::procrustes::nearest_rotation;
@@ -21,13 +21,7 @@ const FOCALS: usize = 16;
 const TILTS: usize = 6;
 const TILT_STEP: f64 = std::f64::consts::PI / 12.0;
 /// The refinement: its start is near the minimum, and bundle adjustment follows.
-const OPTIONS: levenberg_marquardt::Options = levenberg_marquardt::Options {
-    max_iterations: 30,
-    relative_tolerance: 1e-6,
-    initial_damping: 1e-3,
-    min_damping: MIN_DAMPING,
-    hopeless_above: f64::INFINITY,
-};
+const OPTIONS: Options = Options { relative_tolerance: 1e-6, initial_damping: 1e-3, ..Options::DEFAULT };
 /// Log focal lengths and normals that are nearer than this are the same start: adjustment takes them to one minimum.
 const SAME: f64 = 0.05;
 

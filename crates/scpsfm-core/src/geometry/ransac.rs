@@ -5,7 +5,7 @@ use nalgebra::{SVector, Vector2};
 use rand::seq::index;
 use rand_chacha::ChaCha8Rng;
 
-use super::levenberg_marquardt::{self, Normal};
+use super::levenberg_marquardt::{self, Normal, Options};
 use crate::domain::StopToken;
 
 /// Probability with which one sample without outliers is to be among those drawn.
@@ -59,13 +59,7 @@ pub(crate) trait Refinable<const N: usize>: Estimator {
 }
 
 /// The refinement of a model that is nearly right.
-const REFINEMENT: levenberg_marquardt::Options = levenberg_marquardt::Options {
-    max_iterations: 10,
-    relative_tolerance: 1e-6,
-    initial_damping: 1e-4,
-    min_damping: levenberg_marquardt::MIN_DAMPING,
-    hopeless_above: f64::INFINITY,
-};
+const REFINEMENT: Options = Options { max_iterations: 10, relative_tolerance: 1e-6, ..Options::DEFAULT };
 /// Gates beyond which a datum weighs nothing in a refinement: a hundredth of its weight is left there.
 const WEIGHED_GATES: f64 = 9.0;
 

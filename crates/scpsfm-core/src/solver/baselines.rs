@@ -70,7 +70,7 @@ pub fn reconstruct(block: &CompleteBlock, inlier: &[bool], noise: f64, stop: &St
         let options = bundle::Options {
             max_iterations: ADJUSTMENT_ITERATIONS,
             loss: ConsensusOptions::DEFAULT.loss(noise),
-            ..Default::default()
+            ..bundle::Options::DEFAULT
         };
         projective::adjust(&mut cameras, &mut points, &observations, &options, stop);
         let judged = consensus::judge(block, cameras.clone(), noise, stop);

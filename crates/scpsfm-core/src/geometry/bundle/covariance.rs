@@ -308,7 +308,7 @@ mod tests {
             scene.observe(0.0005, &mut rand::SeedableRng::seed_from_u64(seed));
             let adjusted = |start: &MetricReconstruction, model, prior: &IntrinsicsPrior| {
                 let mut start = start.clone();
-                let options = Options { max_iterations: 100, relative_tolerance: 1e-13, ..Options::default() };
+                let options = Options { max_iterations: 100, relative_tolerance: 1e-13, ..Options::DEFAULT };
                 let stop = StopToken::default();
                 let report =
                     adjust_all(&mut start, &scene.observations, model, std::slice::from_ref(prior), &options, &stop);
@@ -368,7 +368,7 @@ mod tests {
             println!("seed {seed}");
             let scene = testing::scene(seed, 8, 40, NOISE);
             let adjusted = |mut start: MetricReconstruction, model: IntrinsicsModel| {
-                let options = Options { max_iterations: 100, relative_tolerance: 1e-13, ..Options::default() };
+                let options = Options { max_iterations: 100, relative_tolerance: 1e-13, ..Options::DEFAULT };
                 let priors = [IntrinsicsPrior::NONE; 2];
                 adjust_all(&mut start, &scene.observations, model, &priors, &options, &StopToken::default());
                 start

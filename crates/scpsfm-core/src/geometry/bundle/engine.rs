@@ -7,7 +7,7 @@ use super::problem::{BundleProblem, Layout, UNDEFINED_SQUARED, usable_squared_no
 use super::reduced::{Linearisation, Reduced};
 use super::{Loss, Observation, Options, Report};
 use crate::domain::StopToken;
-use crate::geometry::levenberg_marquardt::{self, MIN_DAMPING};
+use crate::geometry::levenberg_marquardt;
 
 /// Sum of the loss over the observations.
 fn cost<const C: usize, const P: usize>(problem: &impl BundleProblem<C, P>, layout: &Layout, loss: Loss) -> f64 {
@@ -56,7 +56,7 @@ pub(super) fn descend<const C: usize, const P: usize, T: BundleProblem<C, P>>(
         reduced: Reduced::new(layout, cameras),
         problem: PhantomData,
     };
-    levenberg_marquardt::minimise(&mut dense, problem, &options.of_loop(MIN_DAMPING), stop)
+    levenberg_marquardt::minimise(&mut dense, problem, options, stop)
 }
 
 /// A problem with its normal equations, whose reduced system is dense.

@@ -303,7 +303,7 @@ mod tests {
                 &scene.observations,
                 IntrinsicsModel::FOCAL,
                 &[IntrinsicsPrior::NONE],
-                &Options { max_iterations: 60, ..Options::default() },
+                &Options { max_iterations: 60, ..Options::DEFAULT },
                 &StopToken::default(),
             );
             let freedom = 2 * scene.observations.len() - (6 * 8 + 3 * 30 - 7 + 1);
@@ -338,7 +338,7 @@ mod tests {
                 let seen = Observation::new(view, start.points.len() - 1, Vector2::zeros());
                 observations.push(Observation { xy: start.residual(&seen), ..seen });
             }
-            let options = Options { max_iterations: 60, relative_tolerance: 1e-12, ..Options::default() };
+            let options = Options { max_iterations: 60, relative_tolerance: 1e-12, ..Options::DEFAULT };
             let (model, priors) = (IntrinsicsModel::FOCAL, [IntrinsicsPrior::NONE]);
             adjust_all(&mut start, &observations, model, &priors, &options, &StopToken::default());
             for (k, point) in start.points.iter().enumerate() {
@@ -353,7 +353,7 @@ mod tests {
         let scene = testing::scene(4, 6, 20, NOISE);
         let adjusted = |prior: &IntrinsicsPrior| {
             let mut start = scene.reconstruction();
-            let options = Options { max_iterations: 60, relative_tolerance: 1e-12, ..Options::default() };
+            let options = Options { max_iterations: 60, relative_tolerance: 1e-12, ..Options::DEFAULT };
             let report = adjust_all(
                 &mut start,
                 &scene.observations,
@@ -385,7 +385,7 @@ mod tests {
         let scene = testing::scene(2, 4, 12, NOISE);
         let mut start = testing::perturbed(&scene.reconstruction(), 0.01, 2);
         let before = start.intrinsics.clone();
-        let options = Options::default();
+        let options = Options::DEFAULT;
         let (model, prior) = (IntrinsicsModel::FIXED, IntrinsicsPrior::NONE);
         let report = adjust_all(&mut start, &scene.observations, model, &[prior], &options, &StopToken::default());
         assert!(report.iterations > 0);
@@ -396,7 +396,7 @@ mod tests {
     fn degenerate_input_neither_panics_nor_yields_nan() {
         let scene = testing::scene(3, 4, 8, NOISE);
         let run = |mut start: MetricReconstruction, observations: &[Observation]| {
-            let options = Options::default();
+            let options = Options::DEFAULT;
             for model in [IntrinsicsModel::FIXED, IntrinsicsModel::FOCAL, IntrinsicsModel::FULL] {
                 let prior = IntrinsicsPrior::NONE;
                 let report = adjust_all(&mut start, observations, model, &[prior], &options, &StopToken::default());

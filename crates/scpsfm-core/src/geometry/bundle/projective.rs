@@ -110,7 +110,7 @@ mod tests {
 
     fn adjusted(problem: &mut Projective, observations: &[Observation]) -> Report {
         let Projective { cameras, points } = problem;
-        adjust(cameras, points, observations, &Options::default(), &StopToken::default())
+        adjust(cameras, points, observations, &Options::DEFAULT, &StopToken::default())
     }
 
     #[test]
@@ -137,7 +137,7 @@ mod tests {
         observations[7].xy += Vector2::new(0.4, -0.3);
         let rms_of_the_rest = |loss| {
             let Projective { mut cameras, mut points } = problem.clone();
-            let options = Options { loss, ..Options::default() };
+            let options = Options { loss, ..Options::DEFAULT };
             adjust(&mut cameras, &mut points, &observations, &options, &StopToken::default());
             let squared = observations.iter().enumerate().filter(|(k, _)| *k != 7).map(|(_, seen)| {
                 let y = cameras[seen.view] * points[seen.point];
@@ -203,7 +203,7 @@ mod tests {
         let stop = StopToken::default();
         stop.stop(crate::domain::StopReason::Cancelled);
         let before = problem.points.clone();
-        let report = adjust(&mut problem.cameras, &mut problem.points, &observations, &Options::default(), &stop);
+        let report = adjust(&mut problem.cameras, &mut problem.points, &observations, &Options::DEFAULT, &stop);
         assert_eq!(report.iterations, 0);
         assert!(problem.points.iter().zip(&before).all(|(point, before)| (point - before.normalize()).norm() < 1e-12));
     }

@@ -13,7 +13,7 @@ pub use self::frame::{CanonicalFrame, oriented, to_canonical_frame};
 pub use self::starts::{linear, scan, scan_focal, scan_planes};
 pub use self::view_focals::{view_focal, view_focal_starts};
 use super::bundle::metric::Intrinsics;
-use super::levenberg_marquardt::{self, LeastSquares, MIN_DAMPING, Normal};
+use super::levenberg_marquardt::{self, LeastSquares, Normal, Options};
 use crate::domain::StopToken;
 
 /// Unknowns of the refinement: log focal and the plane at infinity.
@@ -128,12 +128,11 @@ pub enum Free {
 ///
 /// Never worse than the start; not a number only if the start is.
 pub fn refine(cameras: &[Matrix3x4<f64>], start: Daq, free: Free, max_iterations: usize) -> (Daq, f64) {
-    let options = levenberg_marquardt::Options {
+    let options = Options {
         max_iterations,
         relative_tolerance: RELATIVE_TOLERANCE,
         initial_damping: INITIAL_DAMPING,
-        min_damping: MIN_DAMPING,
-        hopeless_above: f64::INFINITY,
+        ..Options::DEFAULT
     };
     let mut best = start;
     let mut refinement = Refinement { cameras, free, normal: Normal::zeros() };

@@ -158,7 +158,7 @@ impl SearchOptions {
         bundle::Options {
             max_iterations: self.first_iterations,
             relative_tolerance: self.first_tolerance,
-            ..bundle::Options::default()
+            ..bundle::Options::DEFAULT
         }
     }
 
@@ -167,7 +167,7 @@ impl SearchOptions {
         bundle::Options {
             max_iterations: self.final_iterations,
             relative_tolerance: self.final_tolerance,
-            ..bundle::Options::default()
+            ..bundle::Options::DEFAULT
         }
     }
 }

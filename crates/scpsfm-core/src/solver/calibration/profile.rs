@@ -140,7 +140,7 @@ mod tests {
                 let mut rise = |shift: f64| {
                     let mut moved = best.minimum.reconstruction.clone();
                     moved.scale_focals(shift.exp());
-                    let options = Options { max_iterations: 5000, relative_tolerance: 1e-13, ..Options::default() };
+                    let options = Options { max_iterations: 5000, relative_tolerance: 1e-13, ..Options::DEFAULT };
                     let model = model.without_focal();
                     let (observations, stop) = (problem.observations, problem.stop);
                     let report = sequence::adjust_all(&mut moved, observations, model, &priors, &options, stop);

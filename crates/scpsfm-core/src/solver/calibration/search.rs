@@ -193,7 +193,7 @@ impl Search<'_> {
         stretch: Option<&Stretch>,
     ) -> Result<Vec<Minimum>, Error> {
         let options = &self.problem.options.search;
-        let following = Options { max_iterations: options.following_iterations, ..Options::default() };
+        let following = Options { max_iterations: options.following_iterations, ..Options::DEFAULT };
         // Poses and points follow: freed at once, they would only go back to where they were.
         let start = |search: &Search, metric: &MetricReconstruction, factor: f64| {
             let start = metric.clone().with_scaled_focals(factor);

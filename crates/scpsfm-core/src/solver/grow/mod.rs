@@ -62,7 +62,7 @@ impl<'a> Fits<'a> {
         }
         let (mut cameras, mut points) = (cameras.to_vec(), points);
         let observations = observations_of(self.block, support);
-        let options = bundle::Options { max_iterations: iterations, loss, ..bundle::Options::default() };
+        let options = bundle::Options { max_iterations: iterations, loss, ..bundle::Options::DEFAULT };
         let report = projective::adjust(&mut cameras, &mut points, &observations, &options, self.stop);
         let judged = judge(self.block, cameras, self.noise, self.stop);
         let converged = report.iterations < iterations && !self.stop.is_stopped();

@@ -99,7 +99,7 @@ fn calibrated(
             MetricReconstruction { intrinsics: lenses.clone(), group_of: (0..lenses.len()).collect(), ..upgraded };
         // A wrong track may fit projective cameras that bend to it.
         let loss = Loss::Cauchy { scale: GrowthOptions::METRIC.cauchy_scale * of_scene };
-        let options = Options { max_iterations: OPTIONS.iterations, loss, ..Options::default() };
+        let options = Options { max_iterations: OPTIONS.iterations, loss, ..Options::DEFAULT };
         let report = sequence::adjust_all(&mut metric, &observations, model, &priors, &options, problem.stop);
         (metric, report.cost)
     };

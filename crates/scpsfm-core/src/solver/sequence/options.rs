@@ -77,7 +77,7 @@ impl GrowthOptions {
     /// How to adjust at this core noise.
     pub fn adjustment(&self, max_iterations: usize, noise: f64) -> Options {
         let loss = Loss::Cauchy { scale: self.cauchy_scale * noise };
-        Options { max_iterations, relative_tolerance: self.tolerance, loss, ..Options::default() }
+        Options { max_iterations, relative_tolerance: self.tolerance, loss, ..Options::DEFAULT }
     }
 }
 

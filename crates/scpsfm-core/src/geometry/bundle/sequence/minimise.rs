@@ -15,11 +15,6 @@ use crate::domain::StopToken;
 use crate::geometry::levenberg_marquardt::{self, LeastSquares, StepCost};
 use crate::parallel::Threads;
 
-/// Least damping, as a share of the diagonal. Lower than for a block: the weakest directions of a long chain of views
-/// would hardly move at a block's. Where rounding takes the system's definiteness, the attempt fails and is repeated
-/// with more.
-const MIN_DAMPING: f64 = 1e-14;
-
 /// Factor by which a step may raise the cost for its points to be iterated. A chain of 100 views bent by half a radian
 /// takes 14 steps with 2, 9 with 10; but from a start with cameras a quarter of the depth away, points end in
 /// false places with 10 and do not with 2.
@@ -62,7 +57,7 @@ pub fn adjust(
     let normal = Normal::new(&layout, &pattern, sequence);
     let reduced = Reduced::new(&layout, pattern);
     let mut descent = Descent { priors, loss, normal, reduced, solver, pool: &pool, heartbeat };
-    let report = levenberg_marquardt::minimise(&mut descent, sequence, &options.of_loop(MIN_DAMPING), stop);
+    let report = levenberg_marquardt::minimise(&mut descent, sequence, options, stop);
     sequence.average_focals();
     report
 }
@@ -100,6 +95,10 @@ struct Descent<'a> {
 
 impl LeastSquares for Descent<'_> {
     type State = MetricReconstruction;
+
+    /// Lower than for a dense system: the weakest directions of a long chain of views would hardly move at its damping.
+    /// Where rounding takes the system's definiteness, the attempt fails and is repeated with more.
+    const MIN_DAMPING: f64 = 1e-14;
 
     fn cost(&self, sequence: &MetricReconstruction) -> f64 {
         cost(sequence, self.priors, self.loss, self.pool).unwrap_or(f64::INFINITY)

@@ -52,7 +52,7 @@ fn drift_is_undone_in_few_steps() {
         let models = [IntrinsicsModel::FOCAL];
         let best = adjusted(&mut truth.clone(), &observations, &models, &thorough());
         let mut start = bent(&truth, 0.5);
-        let report = adjusted(&mut start, &observations, &models, &Options::default());
+        let report = adjusted(&mut start, &observations, &models, &Options::DEFAULT);
         println!("seed {seed}: least {best:?}, from a bend {report:?}");
         assert!(report.initial_cost > 50.0 * best.cost, "seed {seed}: {report:?}");
         assert!(report.cost / best.cost - 1.0 < 1e-6, "seed {seed}: {report:?} {best:?}");
@@ -164,7 +164,7 @@ fn threads_change_nothing_to_the_last_bit() {
     let (views, points): (Vec<bool>, Vec<bool>) =
         ((0..24).map(|view| view != 9).collect(), (0..truth.points.len()).map(|point| point % 50 != 3).collect());
     let free = Free { models: &models, views: Some(&views), points: Some(&points) };
-    let options = Options { max_iterations: 4, loss: Loss::Cauchy { scale: 0.004 }, ..Options::default() };
+    let options = Options { max_iterations: 4, loss: Loss::Cauchy { scale: 0.004 }, ..Options::DEFAULT };
     let on = |threads: usize| {
         let (mut start, mut beats) = (perturbed(&truth, 0.01, 5), 0);
         let stop = StopToken::default();
@@ -187,7 +187,7 @@ fn threads_change_nothing_to_other_systems_either() {
         let on = |threads: usize| {
             let (mut start, stop) = (perturbed(&truth, 0.003, 5), StopToken::default());
             let run = Run { threads: Threads::new(threads), stop: &stop, heartbeat: &mut || () };
-            let options = Options { max_iterations: 3, ..Options::default() };
+            let options = Options { max_iterations: 3, ..Options::DEFAULT };
             let report = adjust(&mut start, &observations, &Free::all(&[IntrinsicsModel::FOCAL]), &[], &options, run);
             (start, report)
         };

@@ -9,7 +9,7 @@ fn run(mut sequence: MetricReconstruction, observations: &[Observation]) -> Metr
     {
         for loss in [Loss::Squared, Loss::Cauchy { scale: 0.003 }] {
             let models = vec![model; sequence.intrinsics.len()];
-            let options = Options { loss, ..Options::default() };
+            let options = Options { loss, ..Options::DEFAULT };
             let report = adjusted(&mut sequence, observations, &models, &options);
             assert!(report.cost.is_finite() && report.cost <= report.initial_cost, "{report:?}");
         }
@@ -74,8 +74,8 @@ fn what_is_no_number_or_out_of_range_is_left_alone() {
             observations.push(Observation { weight, ..first });
         }
         let models = [IntrinsicsModel::FOCAL];
-        let report = adjusted(&mut start, &observations, &models, &Options::default());
-        assert_eq!(report, adjusted(&mut same, &clean, &models, &Options::default()));
+        let report = adjusted(&mut start, &observations, &models, &Options::DEFAULT);
+        assert_eq!(report, adjusted(&mut same, &clean, &models, &Options::DEFAULT));
         assert_eq!(start, same);
 
         let mut broken = perturbed(&truth, 0.005, 2);

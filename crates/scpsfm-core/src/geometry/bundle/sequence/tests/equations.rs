@@ -224,7 +224,7 @@ fn a_stop_is_seen_within_one_linearisation() {
         assert_eq!(pool.of_points(Some), None, "{threads} threads");
     }
     let mut start = sequence.clone();
-    let report = adjust(&mut start, &observations, &free, &[], &Options::default(), quiet(&stop, &mut || ()));
+    let report = adjust(&mut start, &observations, &free, &[], &Options::DEFAULT, quiet(&stop, &mut || ()));
     assert_eq!((report.iterations, report.cost), (0, report.initial_cost));
     assert_eq!(start, sequence);
 }

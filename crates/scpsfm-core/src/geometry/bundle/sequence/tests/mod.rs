@@ -95,7 +95,7 @@ fn bent(straight: &MetricReconstruction, angle: f64) -> MetricReconstruction {
 
 /// To the last digit.
 fn thorough() -> Options {
-    Options { max_iterations: 100, relative_tolerance: 1e-14, ..Options::default() }
+    Options { max_iterations: 100, relative_tolerance: 1e-14, ..Options::DEFAULT }
 }
 
 fn adjusted(
