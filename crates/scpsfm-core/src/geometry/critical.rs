@@ -5,9 +5,7 @@
 
 use nalgebra::{Matrix3, Rotation3, Vector2, Vector3};
 
-use super::bundle::critical::{
-    BundleProblem, HOMOGRAPHIES_GAUGE, Homographies, TRANSLATING_GAUGE, Translating, minimise,
-};
+use super::bundle::critical::{HOMOGRAPHIES_GAUGE, Homographies, TRANSLATING_GAUGE, Translating, minimise};
 use super::bundle::metric::{Intrinsics, IntrinsicsModel, IntrinsicsPrior, MetricReconstruction, Pose};
 use super::bundle::sequence;
 use super::bundle::{Loss, Options};
@@ -30,7 +28,7 @@ const MOST_MISSED: f64 = 1.0;
 /// Rounds of alternation for the depths of a translation's start; the adjustment does the rest.
 const DEPTH_ROUNDS: usize = 10;
 /// Iterations of each adjustment: they start near the minimum, or the model is wrong and its cost only has to show it.
-const ITERATIONS: usize = 30;
+pub const ITERATIONS: usize = 30;
 
 /// A model at its minimum.
 #[derive(Debug, Clone)]
@@ -42,65 +40,43 @@ pub struct CriticalFit<M> {
     pub unknowns: usize,
 }
 
-/// Homographies from a reference view, and where it sees each point: what fits without parallax start from.
-#[derive(Debug, Clone)]
-pub struct ReferenceHomographies {
-    views: Vec<Matrix3<f64>>,
-    positions: Vec<Option<Vector2<f64>>>,
-}
-
-impl ReferenceHomographies {
-    /// Returns `None` where common points do not tie all views together.
-    pub fn new(observations: &[Observation], views: usize, points: usize, noise: f64) -> Option<Self> {
-        let seen = Correspondences::new(observations, views);
-        let reference = seen.most_observed()?;
-        let placed = seen.homographies_from(reference, noise)?;
-        let position = |point: &Option<Vector3<f64>>| {
-            let position = point.map(|point| point.xy() / point.z)?;
-            position.iter().all(|value| value.is_finite()).then_some(position)
-        };
-        let mut positions: Vec<Option<Vector2<f64>>> = placed.points.iter().map(position).collect();
-        positions.resize(points, None);
-        Some(Self { views: placed.views, positions })
-    }
-
-    /// Squared residuals of the observations, weighted, of homographies that are adjusted under a loss that bounds what a
-    /// minority of them can do.
-    ///
-    /// * `noise`: one standard deviation of a coordinate, normalised units
-    pub fn squared_residuals(&self, observations: &[Observation], noise: f64, stop: &StopToken) -> Vec<f64> {
-        let mut adjusted = self.homographies();
-        let loss = Loss::Cauchy { scale: CAUCHY_SCALE * noise };
-        minimise(&mut adjusted, observations, &Options { loss, ..Options::squared(ITERATIONS) }, stop);
-        let squared = |seen: &Observation| {
-            let moved = adjusted.views.get(seen.view)? * adjusted.points.get(seen.point)?.push(1.0);
-            Some(seen.weight * (moved.xy() / moved.z - seen.xy).norm_squared())
-        };
-        observations.iter().map(|seen| squared(seen).unwrap_or(f64::INFINITY)).collect()
-    }
-
-    fn homographies(&self) -> Homographies {
-        let points = self.positions.iter().map(|position| position.unwrap_or_default()).collect();
-        Homographies { views: self.views.clone(), points }
-    }
-
-    /// Unknowns of homographies and their points, the gauge taken off.
-    pub fn unknowns(&self) -> usize {
-        unknowns_of_homographies(self.views.len(), self.observed())
-    }
-
-    fn observed(&self) -> usize {
-        self.positions.iter().flatten().count()
-    }
-}
-
-/// Fits a plane.
-pub fn fit_plane(
-    start: &ReferenceHomographies,
+/// Homographies from a reference view, and where it sees each point, the origin for points that no view sees: what fits
+/// without parallax start from.
+///
+/// Returns `None` where common points do not tie all views together.
+pub fn reference_homographies(
     observations: &[Observation],
-    stop: &StopToken,
-) -> CriticalFit<Homographies> {
-    fit_homographies(start.homographies(), start.observed(), observations, ITERATIONS, stop)
+    views: usize,
+    points: usize,
+    noise: f64,
+) -> Option<Homographies> {
+    let seen = Correspondences::new(observations, views);
+    let reference = seen.most_observed()?;
+    let placed = seen.homographies_from(reference, noise)?;
+    let position = |point: &Option<Vector3<f64>>| {
+        let position = point.map(|point| point.xy() / point.z)?;
+        position.iter().all(|value| value.is_finite()).then_some(position)
+    };
+    let mut positions: Vec<Vector2<f64>> =
+        placed.points.iter().map(|point| position(point).unwrap_or_default()).collect();
+    positions.resize(points, Vector2::zeros());
+    Some(Homographies { views: placed.views, points: positions })
+}
+
+/// Squared residuals of the observations, weighted, of homographies that are adjusted under a loss that bounds what a
+/// minority of them can do.
+///
+/// * `start`: see [`reference_homographies`]
+/// * `noise`: one standard deviation of a coordinate, normalised units
+pub fn squared_residuals(start: &Homographies, observations: &[Observation], noise: f64, stop: &StopToken) -> Vec<f64> {
+    let mut adjusted = start.clone();
+    let loss = Loss::Cauchy { scale: CAUCHY_SCALE * noise };
+    minimise(&mut adjusted, observations, &Options { loss, ..Options::squared(ITERATIONS) }, stop);
+    let squared = |seen: &Observation| {
+        let moved = adjusted.views.get(seen.view)? * adjusted.points.get(seen.point)?.push(1.0);
+        Some(seen.weight * (moved.xy() / moved.z - seen.xy).norm_squared())
+    };
+    observations.iter().map(|seen| squared(seen).unwrap_or(f64::INFINITY)).collect()
 }
 
 /// Fits a camera that only turns, first with its focal length alone free, then with this model.
@@ -155,17 +131,18 @@ pub fn homographies_of(rotation: &MetricReconstruction) -> Option<Homographies> 
 
 /// Fits homographies from here.
 pub fn fit_homographies(
-    start: Homographies,
-    observed: usize,
+    mut model: Homographies,
     observations: &[Observation],
     iterations: usize,
     stop: &StopToken,
 ) -> CriticalFit<Homographies> {
-    let unknowns = unknowns_of_homographies(start.views.len(), observed);
-    adjusted(start, unknowns, iterations, observations, stop)
+    let unknowns = unknowns_of_homographies(model.views.len(), observed_points(observations, model.points.len()));
+    let report = minimise(&mut model, observations, &Options::squared(iterations), stop);
+    CriticalFit { model, cost: report.cost, unknowns }
 }
 
-fn unknowns_of_homographies(views: usize, points: usize) -> usize {
+/// Unknowns of homographies of so many views, and so many points that have an observation, the gauge taken off.
+pub fn unknowns_of_homographies(views: usize, points: usize) -> usize {
     (8 * views + 2 * points).saturating_sub(HOMOGRAPHIES_GAUGE)
 }
 
@@ -236,17 +213,6 @@ fn positions(observations: &[Observation], views: usize, points: usize, referenc
     positions
 }
 
-fn adjusted<const C: usize, const P: usize, M: BundleProblem<C, P>>(
-    mut model: M,
-    unknowns: usize,
-    iterations: usize,
-    observations: &[Observation],
-    stop: &StopToken,
-) -> CriticalFit<M> {
-    let report = minimise(&mut model, observations, &Options::squared(iterations), stop);
-    CriticalFit { model, cost: report.cost, unknowns }
-}
-
 /// Fits a camera that moves without turning.
 ///
 /// Without rotation the fundamental matrix of two views is `[e]x`, of their epipole (Hartley & Zisserman, section
@@ -279,7 +245,8 @@ pub fn fit_translation(
     let mut model = Translating { translations: epipoles, points: at_unit_depth.collect() };
     alternate(&mut model, observations, reference);
     let unknowns = (3 * (views + observed)).saturating_sub(TRANSLATING_GAUGE);
-    Some(adjusted(model, unknowns, ITERATIONS, observations, stop))
+    let report = minimise(&mut model, observations, &Options::squared(ITERATIONS), stop);
+    Some(CriticalFit { model, cost: report.cost, unknowns })
 }
 
 /// The common epipole of two views that are not turned to each other: it lies on the line through each point's images.
@@ -356,8 +323,8 @@ mod tests {
         let stop = StopToken::default();
         let reduced =
             |cost: f64, unknowns: usize| cost / (noise * noise * (2 * scene.observations.len() - unknowns) as f64);
-        let start = ReferenceHomographies::new(&scene.observations, views, points, noise).expect("complete tracks");
-        let plane = fit_plane(&start, &scene.observations, &stop);
+        let start = reference_homographies(&scene.observations, views, points, noise).expect("complete tracks");
+        let plane = fit_homographies(start, &scene.observations, ITERATIONS, &stop);
         let turning = rotation_start(&scene.observations, views, points, noise).expect("complete tracks");
         let turning =
             fit_rotation(&turning, &scene.observations, &vec![0; views], FULL, &PRIORS, &stop).expect("turns");
@@ -401,14 +368,14 @@ mod tests {
         assert!((0.6..1.4).contains(&ratio), "{ratio}");
         let stop = StopToken::default();
         assert!(fit_translation(&[], 0, 0, NOISE, 5.0, &stop).is_none());
-        assert!(ReferenceHomographies::new(&[], 3, 0, NOISE).is_none());
+        assert!(reference_homographies(&[], 3, 0, NOISE).is_none());
         scene.observations.iter_mut().for_each(|seen| seen.xy = Vector2::new(f64::NAN, 1e200));
         assert!(fit_translation(&scene.observations, 8, 40, NOISE, 5.0, &stop).is_none());
-        assert!(ReferenceHomographies::new(&scene.observations, 8, 40, NOISE).is_none());
+        assert!(reference_homographies(&scene.observations, 8, 40, NOISE).is_none());
         scene.observations.iter_mut().for_each(|seen| seen.xy = Vector2::new(0.25, 0.5));
         fit_translation(&scene.observations, 8, 40, NOISE, 5.0, &stop);
-        if let Some(start) = ReferenceHomographies::new(&scene.observations, 8, 40, NOISE) {
-            fit_plane(&start, &scene.observations, &stop);
+        if let Some(start) = reference_homographies(&scene.observations, 8, 40, NOISE) {
+            fit_homographies(start, &scene.observations, ITERATIONS, &stop);
         }
         if let Some(start) = rotation_start(&scene.observations, 8, 40, NOISE) {
             fit_rotation(&start, &scene.observations, &[0; 8], FULL, &PRIORS, &stop);

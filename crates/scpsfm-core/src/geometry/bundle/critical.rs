@@ -8,8 +8,7 @@ use nalgebra::{Matrix3, SMatrix, SVector, Vector2, Vector3};
 
 use super::Observation;
 pub(crate) use super::engine::minimise;
-pub(crate) use super::problem::BundleProblem;
-use super::problem::{Jacobian, Step, image, move_each, unit_norm};
+use super::problem::{BundleProblem, Jacobian, Step, image, move_each, unit_norm};
 
 /// Views of a plane, or of anything from one centre: `x ~ H (x, y, 1)`.
 #[derive(Debug, Clone)]

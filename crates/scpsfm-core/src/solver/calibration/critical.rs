@@ -10,7 +10,7 @@ use crate::domain::{VERIFIED, Warning, WarningCode};
 use crate::geometry::bundle::critical::{Homographies, Translating};
 use crate::geometry::bundle::metric::{Extension, IntrinsicsModel, IntrinsicsPrior, MetricReconstruction};
 use crate::geometry::bundle::projective;
-use crate::geometry::critical::{self, ReferenceHomographies};
+use crate::geometry::critical;
 use crate::geometry::homography::{self, LEAST_COMMON};
 use crate::geometry::observation::{Observation, observed_points};
 use crate::geometry::statistics::{CHI_SQUARE_OF_TWO, core_noise};
@@ -51,9 +51,10 @@ pub(super) fn without_unsupported(problem: &Uncalibrated) -> Option<Vec<Observat
     let Uncalibrated { observations, noise, outlier_density, .. } = *problem;
     let (views, points) = (problem.cameras.len(), problem.points.len());
     homography::median_residual(observations, views, noise, problem.options.critical.lens_limit)?;
-    let start = ReferenceHomographies::new(observations, views, points, noise)?;
-    let squared = start.squared_residuals(observations, noise, problem.stop);
-    let noise_of_homographies = core_noise(squared.iter().map(|squared| squared.sqrt()).collect(), start.unknowns())?;
+    let start = critical::reference_homographies(observations, views, points, noise)?;
+    let squared = critical::squared_residuals(&start, observations, noise, problem.stop);
+    let unknowns = critical::unknowns_of_homographies(views, observed_points(observations, points));
+    let noise_of_homographies = core_noise(squared.iter().map(|squared| squared.sqrt()).collect(), unknowns)?;
     let limit = CHI_SQUARE_OF_TWO * noise_of_homographies.powi(2);
     let mut explained = vec![0; points];
     for (seen, _) in observations.iter().zip(&squared).filter(|(_, squared)| **squared < limit) {
@@ -72,7 +73,7 @@ pub(super) fn without_unsupported(problem: &Uncalibrated) -> Option<Vec<Observat
     if !is_enough || kept.len() == observations.len() {
         return None;
     }
-    let unknowns = start.unknowns().saturating_sub(2 * (inliers - kept_inliers));
+    let unknowns = unknowns.saturating_sub(2 * (inliers - kept_inliers));
     let of_homographies = evidence(kept.len(), unknowns, noise_of_homographies, outlier_density);
     let of_all = evidence(observations.len(), projective::unknowns(views, inliers), noise, outlier_density);
     (of_homographies > of_all).then_some(kept)
@@ -132,11 +133,11 @@ fn without_parallax(
     let (views, points) = (problem.cameras.len(), problem.points.len());
     let priors = problem.priors(fit.noise);
     let fits = || {
-        let plane = ReferenceHomographies::new(observations, views, points, fit.noise)?;
+        let plane = critical::reference_homographies(observations, views, points, fit.noise)?;
         let start = critical::rotation_start(observations, views, points, fit.noise)?;
         let model = IntrinsicsModel::focal(focal_per_view).with_all_extensions();
         let rotation = critical::fit_rotation(&start, observations, group_of, model, &priors, stop)?;
-        Some((critical::fit_plane(&plane, observations, stop), rotation, start))
+        Some((critical::fit_homographies(plane, observations, critical::ITERATIONS, stop), rotation, start))
     };
     let Some((plane, rotation, start)) = fits() else {
         if !is_flat {

@@ -85,9 +85,8 @@ fn undistorted_fits(best: &Candidate, problem: &Uncalibrated) -> Option<(Fit, Fi
     pinhole.intrinsics.iter_mut().for_each(|lens| *lens = lens.pinhole());
     let projective = match pinhole.has_common_centre {
         true => {
-            let (start, iterations) = (critical::homographies_of(&pinhole)?, options.max_iterations);
-            let observed = problem.observed_points();
-            let found = critical::fit_homographies(start, observed, &observations, iterations, problem.stop);
+            let start = critical::homographies_of(&pinhole)?;
+            let found = critical::fit_homographies(start, &observations, options.max_iterations, problem.stop);
             Fit::new(found.cost, found.unknowns + terms, problem)
         }
         false => {
