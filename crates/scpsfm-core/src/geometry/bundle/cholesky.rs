@@ -4,36 +4,27 @@ use faer::dyn_stack::{MemBuffer, MemStack};
 use faer::linalg::cholesky::llt;
 use faer::{MatMut, MatRef, Par};
 
-/// Factors and solves systems of one size, with the scratch they need.
-pub(super) struct CholeskySolver {
-    dimension: usize,
-    memory: MemBuffer,
-}
-
-impl CholeskySolver {
-    pub fn new(dimension: usize) -> Self {
-        let scratch = llt::factor::cholesky_in_place_scratch::<f64>(dimension, Par::Seq, Default::default());
-        Self { dimension, memory: MemBuffer::new(scratch) }
+/// Solves `A x = b` in place of `b`; `false` when `A` is not positive definite.
+///
+/// * `matrix`: `A`, column-major, as many rows as `b` has, lower triangle; overwritten by its factor
+/// * `vector`: `b`
+pub(super) fn solve(matrix: &mut [f64], vector: &mut [f64]) -> bool {
+    let n = vector.len();
+    // One column: its allocation takes nothing beside the factorisation.
+    let scratch = llt::factor::cholesky_in_place_scratch::<f64>(n, Par::Seq, Default::default());
+    let mut memory = MemBuffer::new(scratch);
+    let stack = MemStack::new(&mut memory);
+    let whole = MatMut::from_column_major_slice_mut(matrix, n, n);
+    if llt::factor::cholesky_in_place(whole, Default::default(), Par::Seq, stack, Default::default()).is_err() {
+        return false;
     }
-
-    /// Solves `A x = b` in place of `b`; `false` when `A` is not positive definite.
-    ///
-    /// * `matrix`: `A`, column-major, lower triangle; overwritten by its factor
-    pub fn solve(&mut self, matrix: &mut [f64], vector: &mut [f64]) -> bool {
-        let n = self.dimension;
-        let stack = MemStack::new(&mut self.memory);
-        let whole = MatMut::from_column_major_slice_mut(matrix, n, n);
-        if llt::factor::cholesky_in_place(whole, Default::default(), Par::Seq, stack, Default::default()).is_err() {
-            return false;
-        }
-        llt::solve::solve_in_place(
-            MatRef::from_column_major_slice(matrix, n, n),
-            MatMut::from_column_major_slice_mut(vector, n, 1),
-            Par::Seq,
-            stack,
-        );
-        true
-    }
+    llt::solve::solve_in_place(
+        MatRef::from_column_major_slice(matrix, n, n),
+        MatMut::from_column_major_slice_mut(vector, n, 1),
+        Par::Seq,
+        stack,
+    );
+    true
 }
 
 #[cfg(test)]
@@ -52,7 +43,7 @@ mod tests {
             let expected = DVector::from_fn(n, |_, _| rng.random_range(-1.0..1.0));
             let mut vector = (&matrix * &expected).as_slice().to_vec();
             let mut lower = matrix.lower_triangle();
-            assert!(CholeskySolver::new(n).solve(lower.as_mut_slice(), &mut vector), "n {n}");
+            assert!(solve(lower.as_mut_slice(), &mut vector), "n {n}");
             let error = (DVector::from_vec(vector) - expected).norm();
             assert!(error < 1e-6, "n {n}: {error}");
         }
@@ -64,7 +55,7 @@ mod tests {
             for wrong in [-1.0, f64::NAN] {
                 let mut matrix = DMatrix::<f64>::identity(n, n);
                 matrix[(n / 2, n / 2)] = wrong;
-                assert!(!CholeskySolver::new(n).solve(matrix.as_mut_slice(), &mut vec![1.0; n]), "n {n}, {wrong}");
+                assert!(!solve(matrix.as_mut_slice(), &mut vec![1.0; n]), "n {n}, {wrong}");
             }
         }
     }

@@ -7,7 +7,7 @@
 
 use nalgebra::{Cholesky, Matrix2, SMatrix, SVector, Vector2};
 
-use super::cholesky::CholeskySolver;
+use super::cholesky;
 use super::panel::Panel;
 use super::problem::{BundleProblem, Jacobian, Layout, Step, usable_squared_norm};
 use super::{Loss, Observation};
@@ -89,7 +89,6 @@ pub(super) struct Reduced<const C: usize, const P: usize> {
     moved: Vec<Vector2<f64>>,
     /// `None` where a point is seen by few of the cameras: pair by pair is then cheaper.
     panel: Option<Panel<C, P>>,
-    solver: CholeskySolver,
     /// What was solved for last.
     pub step: Step<C, P>,
 }
@@ -106,7 +105,6 @@ impl<const C: usize, const P: usize> Reduced<C, P> {
             whitened: Vec::with_capacity(longest),
             moved: Vec::with_capacity(longest),
             panel: Panel::<C, P>::is_worth_it(layout, cameras).then(|| Panel::new(cameras)),
-            solver: CholeskySolver::new(dimension),
             step: Step::zeros(cameras, layout.starts.len() - 1),
         }
     }
@@ -118,7 +116,7 @@ impl<const C: usize, const P: usize> Reduced<C, P> {
             return None;
         }
         self.damp(problem, at, damping);
-        if !self.solver.solve(&mut self.matrix, &mut self.vector) {
+        if !cholesky::solve(&mut self.matrix, &mut self.vector) {
             return None;
         }
         for (camera, values) in self.step.cameras.iter_mut().zip(self.vector.chunks_exact(C)) {

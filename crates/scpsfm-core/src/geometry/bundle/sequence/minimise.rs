@@ -8,7 +8,7 @@ use super::layout::Layout;
 use super::normal::Normal;
 use super::pattern::Pattern;
 use super::reduced::{Reduced, substitute};
-use super::solver::Solver;
+use super::solver::SparseCholesky;
 use super::worker_pool::WorkerPool;
 use super::{CancellationCheck, Free, MetricReconstruction, Observation, Run};
 use crate::domain::StopToken;
@@ -49,14 +49,15 @@ pub fn adjust(
     let loss = options.loss;
     let solvable = || {
         let pattern = Pattern::new(sequence, &layout, &mut cancellation)?;
-        Some((Solver::new(&pattern)?, pattern))
+        let sparse = if pattern.is_square { None } else { Some(SparseCholesky::new(&pattern)?) };
+        Some((sparse, pattern))
     };
-    let Some((solver, pattern)) = (!layout.is_empty()).then(solvable).flatten() else {
+    let Some((sparse, pattern)) = (!layout.is_empty()).then(solvable).flatten() else {
         return Report::at(cost(sequence, priors, loss, &pool).unwrap_or(f64::INFINITY));
     };
     let normal = Normal::new(&layout, &pattern, sequence);
     let reduced = Reduced::new(&layout, pattern);
-    let mut descent = Descent { priors, loss, normal, reduced, solver, pool: &pool, heartbeat };
+    let mut descent = Descent { priors, loss, normal, reduced, sparse, pool: &pool, heartbeat };
     let report = levenberg_marquardt::minimise(&mut descent, sequence, options, stop);
     sequence.average_focals();
     report
@@ -88,7 +89,8 @@ struct Descent<'a> {
     loss: Loss,
     normal: Normal,
     reduced: Reduced,
-    solver: Solver,
+    /// The factorisation of the reduced system; `None` where that is a square matrix.
+    sparse: Option<SparseCholesky>,
     pool: &'a WorkerPool<'a>,
     heartbeat: &'a mut dyn FnMut(),
 }
@@ -115,7 +117,7 @@ impl LeastSquares for Descent<'_> {
             return None;
         }
         reduced.damp(normal, damping);
-        if !reduced.solve(&mut self.solver) {
+        if !reduced.solve(self.sparse.as_mut()) {
             return None;
         }
         let step = &reduced.vector;

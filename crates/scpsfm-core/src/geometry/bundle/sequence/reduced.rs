@@ -5,6 +5,7 @@ use std::ops::Range;
 
 use nalgebra::Vector3;
 
+use super::super::cholesky;
 use super::super::metric::{POINT, POSE};
 use super::super::panel::{self, PANEL_SHARE};
 use super::MetricReconstruction;
@@ -12,7 +13,7 @@ use super::grouped::Grouped;
 use super::layout::Layout;
 use super::normal::Normal;
 use super::pattern::{Column, Pattern};
-use super::solver::Solver;
+use super::solver::SparseCholesky;
 use super::worker_pool::{WorkerPool, split_off};
 use crate::parallel::even_cuts;
 use crate::simd::vectorised;
@@ -165,8 +166,14 @@ impl Reduced {
     }
 
     /// Solves for the step in place of the right-hand side; `false` when the system is not positive definite.
-    pub fn solve(&mut self, solver: &mut Solver) -> bool {
-        solver.solve(&mut self.values, &mut self.vector) && self.vector.iter().all(|value| value.is_finite())
+    ///
+    /// * `sparse`: the factorisation of this pattern; `None` where that is a square matrix, which the factor overwrites
+    pub fn solve(&mut self, sparse: Option<&mut SparseCholesky>) -> bool {
+        let is_solved = match sparse {
+            Some(sparse) => sparse.solve(&self.values, &mut self.vector),
+            None => cholesky::solve(&mut self.values, &mut self.vector),
+        };
+        is_solved && self.vector.iter().all(|value| value.is_finite())
     }
 }
 

@@ -1,4 +1,4 @@
-//! Cholesky factorisation of a system with a block pattern: dense where that is a square matrix, else sparse.
+//! Sparse Cholesky factorisation of a system with a block pattern.
 
 use faer::dyn_stack::{MemBuffer, MemStack, StackReq};
 use faer::perm::Perm;
@@ -7,34 +7,7 @@ use faer::sparse::linalg::cholesky::{SymbolicCholesky, SymmetricOrdering, factor
 use faer::sparse::{SparseColMatRef, SymbolicSparseColMat, SymbolicSparseColMatRef};
 use faer::{Conj, MatMut, Par, Side};
 
-use super::super::cholesky::CholeskySolver;
 use super::pattern::Pattern;
-
-/// Solves systems of one pattern.
-pub(super) enum Solver {
-    Dense(CholeskySolver),
-    Sparse(Box<SparseCholesky>),
-}
-
-impl Solver {
-    /// `None` when the analysis runs out of memory.
-    pub fn new(pattern: &Pattern) -> Option<Self> {
-        if pattern.is_square {
-            return Some(Self::Dense(CholeskySolver::new(pattern.dimension())));
-        }
-        SparseCholesky::new(pattern).map(|cholesky| Self::Sparse(Box::new(cholesky)))
-    }
-
-    /// Solves in place of `vector`; `false` when the matrix is not positive definite.
-    ///
-    /// * `values`: in the order of the pattern; overwritten where that is square
-    pub fn solve(&mut self, values: &mut [f64], vector: &mut [f64]) -> bool {
-        match self {
-            Self::Dense(solver) => solver.solve(values, vector),
-            Self::Sparse(cholesky) => cholesky.solve(values, vector),
-        }
-    }
-}
 
 /// Sparse Cholesky factorisation, supernodal where it pays, in an order of approximately minimum degree.
 pub(super) struct SparseCholesky {

@@ -6,7 +6,7 @@ use std::time::Instant;
 use super::super::CancellationCheck;
 use super::super::layout::Layout;
 use super::super::pattern::Pattern;
-use super::super::solver::Solver;
+use super::super::solver::SparseCholesky;
 use super::*;
 
 /// Steps of a measurement, after which its time is divided.
@@ -42,7 +42,7 @@ fn time_against_observations() {
                 timed(|| Layout::new(&truth, &observations, &Free::all(&models), &mut cancellation).expect("goes on"));
             let (analysis_seconds, _) = timed(|| {
                 let pattern = Pattern::new(&truth, &layout, &mut cancellation).expect("goes on");
-                Solver::new(&pattern).expect("memory")
+                (!pattern.is_square).then(|| SparseCholesky::new(&pattern).expect("memory"))
             });
             drop(layout);
             let (seconds, report) = timed(|| adjusted(&mut start, &observations, &models, &options()));
