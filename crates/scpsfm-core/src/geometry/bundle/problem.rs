@@ -81,11 +81,15 @@ pub(super) struct Layout {
 
 impl Layout {
     pub fn new(observations: &[Observation], cameras: usize, points: usize) -> Self {
-        let mut kept: Vec<Observation> =
-            observations.iter().filter(|seen| seen.is_usable(cameras, points)).copied().collect();
-        kept.sort_by_key(|seen| (seen.point, seen.view));
-        let starts = (0..=points).map(|point| kept.partition_point(|seen| seen.point < point)).collect();
-        Self { observations: kept, starts }
+        let usable = observations.iter().filter(|seen| seen.is_usable(cameras, points));
+        Self::sorted(usable.copied().collect(), points)
+    }
+
+    /// * `observations`: of so many points, all usable
+    pub fn sorted(mut observations: Vec<Observation>, points: usize) -> Self {
+        observations.sort_by_key(|seen| (seen.point, seen.view));
+        let starts = (0..=points).map(|point| observations.partition_point(|seen| seen.point < point)).collect();
+        Self { observations, starts }
     }
 }
 

@@ -1,42 +1,20 @@
-//! Numbers in groups: observations by point or view, points by block.
+//! Numbers in groups: observations by view, points by block.
 
 use std::ops::Range;
 
-/// Numbers in groups, ascending within each.
-#[derive(Debug)]
-pub(super) struct Grouped {
-    /// First member of a group, and at the end the number of members.
-    pub starts: Vec<usize>,
-    /// One group after the other.
-    pub members: Vec<u32>,
+/// The members of each group, in the order of the pairs.
+///
+/// * `pairs`: a group and a member of it
+pub(super) fn grouped(groups: usize, pairs: impl Iterator<Item = (usize, usize)>) -> Vec<Vec<u32>> {
+    let mut grouped = vec![Vec::new(); groups];
+    for (group, member) in pairs {
+        grouped[group].push(member as u32);
+    }
+    grouped
 }
 
-impl Grouped {
-    /// Sorts in linear time.
-    ///
-    /// * `pairs`: a group and a member of it, members ascending
-    pub fn new(groups: usize, pairs: impl Iterator<Item = (usize, usize)> + Clone) -> Self {
-        let mut starts = vec![0; groups + 1];
-        pairs.clone().for_each(|(group, _)| starts[group + 1] += 1);
-        for group in 0..groups {
-            starts[group + 1] += starts[group];
-        }
-        let (mut next, mut members) = (starts.clone(), vec![0; starts[groups]]);
-        for (group, member) in pairs {
-            members[next[group]] = member as u32;
-            next[group] += 1;
-        }
-        Self { starts, members }
-    }
-
-    pub fn of(&self, group: usize) -> &[u32] {
-        &self.members[self.starts[group]..self.starts[group + 1]]
-    }
-
-    /// Members of a group that are in a range.
-    pub fn within(&self, group: usize, range: &Range<usize>) -> &[u32] {
-        let all = self.of(group);
-        let below = |end: usize| all.partition_point(|&member| (member as usize) < end);
-        &all[below(range.start)..below(range.end)]
-    }
+/// Those of a group's members, ascending, that are in a range.
+pub(super) fn within<'a>(members: &'a [u32], range: &Range<usize>) -> &'a [u32] {
+    let below = |end: usize| members.partition_point(|&member| (member as usize) < end);
+    &members[below(range.start)..below(range.end)]
 }

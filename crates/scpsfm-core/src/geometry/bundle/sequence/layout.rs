@@ -6,8 +6,9 @@ use nalgebra::Vector2;
 
 use super::super::intrinsics::Parameter;
 use super::super::metric::{POINT, POSE, VIEW};
-use super::grouped::Grouped;
-use super::{CancellationCheck, Free, MetricReconstruction, Observation, holds};
+use super::super::problem;
+use super::grouped::grouped;
+use super::{CancellationCheck, Free, MetricReconstruction, Observation};
 
 /// The unknowns of views and groups, in blocks: the free views that see something, then the groups with free
 /// intrinsics.
@@ -113,8 +114,8 @@ pub(super) struct Layout {
 }
 
 impl Layout {
-    /// Sorts in linear time. Observations with an index out of range, a coordinate that is not finite or a weight that
-    /// is not positive are left out.
+    /// Observations with an index out of range, a coordinate that is not finite or a weight that is not positive are
+    /// left out.
     ///
     /// Returns `None` when it was stopped.
     pub fn new(
@@ -124,22 +125,25 @@ impl Layout {
         cancellation: &mut CancellationCheck,
     ) -> Option<Self> {
         let points = sequence.points.len();
-        let usable = observations.iter().enumerate().filter(|(_, seen)| holds(sequence, seen));
-        let by_point = Grouped::new(points, usable.map(|(k, seen)| (seen.point, k)));
+        let is_usable = |seen: &&Observation| {
+            let group = sequence.group_of.get(seen.view);
+            seen.is_usable(sequence.poses.len(), points)
+                && group.is_some_and(|group| *group < sequence.intrinsics.len())
+        };
+        let sorted = problem::Layout::sorted(observations.iter().filter(is_usable).copied().collect(), points);
         let mut sees = vec![false; sequence.poses.len()];
-        let mut seen = Vec::with_capacity(by_point.members.len());
-        for &k in &by_point.members {
+        let mut seen = Vec::with_capacity(sorted.observations.len());
+        for Observation { view, xy, weight, .. } in sorted.observations {
             if !cancellation.may_go_on(1) {
                 return None;
             }
-            let Observation { view, xy, weight, .. } = observations[k as usize];
             sees[view] = true;
             seen.push(Seen { view, xy, weight, view_coupling: None, group_coupling: None });
         }
         let mut layout = Self {
             unknowns: Unknowns::new(sequence, free, &sees),
             seen,
-            seen_starts: by_point.starts,
+            seen_starts: sorted.starts,
             incident_blocks: Vec::new(),
             incident_block_starts: vec![0],
             coupling_starts: vec![0],
@@ -159,7 +163,6 @@ impl Layout {
             if !cancellation.may_go_on(seen.len()) {
                 return false;
             }
-            seen.sort_by_key(|seen| seen.view);
             if self.free_points[point] {
                 let first = self.incident_blocks.len();
                 let view = |seen: &Seen| unknowns.view_block[seen.view];
@@ -240,9 +243,9 @@ impl Layout {
         self.seen_starts[points.start]..self.seen_starts[points.end]
     }
 
-    /// Where the observations of each view are among all.
-    pub fn seen_by_view(&self, views: usize) -> Grouped {
-        Grouped::new(views, self.seen.iter().enumerate().map(|(k, seen)| (seen.view, k)))
+    /// Where the observations of each view are among all, ascending.
+    pub fn seen_by_view(&self, views: usize) -> Vec<Vec<u32>> {
+        grouped(views, self.seen.iter().enumerate().map(|(k, seen)| (seen.view, k)))
     }
 
     /// All observations, sorted by point.
@@ -250,9 +253,9 @@ impl Layout {
         &self.seen
     }
 
-    /// Points that are coupled with each block.
-    pub fn points_by_block(&self) -> Grouped {
+    /// Points that are coupled with each block, ascending.
+    pub fn points_by_block(&self) -> Vec<Vec<u32>> {
         let blocks = |point: usize| self.incident_blocks(point).iter().map(move |block| (block.block as usize, point));
-        Grouped::new(self.unknowns.block_count(), (0..self.point_count()).flat_map(blocks))
+        grouped(self.unknowns.block_count(), (0..self.point_count()).flat_map(blocks))
     }
 }

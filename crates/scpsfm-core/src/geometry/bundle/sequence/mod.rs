@@ -47,13 +47,6 @@ impl<'a> Free<'a> {
     }
 }
 
-/// Whether an observation can be used.
-fn holds(reconstruction: &MetricReconstruction, seen: &Observation) -> bool {
-    let has_intrinsics = |group: &usize| *group < reconstruction.intrinsics.len();
-    seen.is_usable(reconstruction.poses.len(), reconstruction.points.len())
-        && reconstruction.group_of.get(seen.view).is_some_and(has_intrinsics)
-}
-
 /// Who does an adjustment, who may end it, and who hears that it goes on.
 pub struct Run<'a> {
     /// However many, they find the same, to the last bit.

@@ -9,7 +9,7 @@ use super::super::Loss;
 use super::super::metric::{IntrinsicsPrior, POSE, Parameter, Projection, ProjectionGradients, VIEW};
 use super::super::problem::usable_squared_norm;
 use super::MetricReconstruction;
-use super::grouped::Grouped;
+use super::grouped::within;
 use super::layout::{Layout, Seen};
 use super::pattern::{Pattern, Place};
 use super::point::PointBlock;
@@ -89,8 +89,8 @@ pub(super) struct Cameras {
     pub gradient: Vec<f64>,
     /// Values and unknowns that belong to the views before each, and to all of them: the groups' come after these.
     before: Vec<(usize, usize)>,
-    /// Where the observations of each view are among all.
-    by_view: Grouped,
+    /// Where the observations of each view are among all, ascending.
+    by_view: Vec<Vec<u32>>,
 }
 
 /// The normal equations `J' J dx = -J' r`.
@@ -270,7 +270,7 @@ impl Cameras {
         let Self { places, values, gradient, before, by_view, .. } = self;
         let layout = pool.layout;
         let seen = layout.seen_range(points);
-        let of_batch = |view: usize| by_view.within(view, &seen);
+        let of_batch = |view: usize| within(&by_view[view], &seen);
         let weights = (0..places.len()).map(|view| of_batch(view).len());
         let (mut values, mut gradient) = (values.as_mut_slice(), gradient.as_mut_slice());
         let cut = |ends: &[usize]| {
@@ -314,7 +314,7 @@ impl Batch<'_> {
     ) -> bool {
         let mut cancellation = self.pool.cancellation();
         let (first_value, first_unknown) = self.before[views.start];
-        let within = |place: Place| Place { start: place.start - first_value, ..place };
+        let of_views = |place: Place| Place { start: place.start - first_value, ..place };
         for view in views {
             let ViewPlaces { view: Some((first, unknowns, place)), group, cross } = self.places[view] else { continue };
             let gradient = &mut gradient[first - first_unknown..];
@@ -324,10 +324,10 @@ impl Batch<'_> {
                 }
                 let Some(row) = &self.rows[k as usize - self.first] else { continue };
                 let own = [&row.view[0][..unknowns], &row.view[1][..unknowns]];
-                add_to_view(values, within(place), unknowns, &row.view, own);
+                add_to_view(values, of_views(place), unknowns, &row.view, own);
                 add_gradient(gradient, own, row.residual);
                 if let Some(((_, free, _), cross)) = group.zip(cross) {
-                    add_product(values, within(cross), row.by_intrinsics(free), own);
+                    add_product(values, of_views(cross), row.by_intrinsics(free), own);
                 }
             }
         }

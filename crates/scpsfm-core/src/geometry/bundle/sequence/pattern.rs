@@ -76,7 +76,7 @@ impl Pattern {
             };
             list(column);
             group.into_iter().for_each(&mut list);
-            for &point in points_by_block.of(column) {
+            for &point in &points_by_block[column] {
                 let incident_blocks = layout.incident_blocks(point as usize);
                 // A look at a block costs a small part of what an observation's linearisation does.
                 if !cancellation.may_go_on(incident_blocks.len().div_ceil(8)) {

@@ -9,7 +9,7 @@ use super::super::cholesky;
 use super::super::metric::{POINT, POSE};
 use super::super::panel::{self, PANEL_SHARE};
 use super::MetricReconstruction;
-use super::grouped::Grouped;
+use super::grouped::within;
 use super::layout::Layout;
 use super::normal::Normal;
 use super::pattern::{Column, Pattern};
@@ -30,8 +30,8 @@ pub(super) struct Reduced {
     pub values: Vec<f64>,
     /// Right-hand side, then solution.
     pub vector: Vec<f64>,
-    /// Points that are coupled with each block.
-    incident_points: Grouped,
+    /// Points that are coupled with each block, ascending.
+    incident_points: Vec<Vec<u32>>,
     /// Couplings of a batch of points, each times the inverse root of its point's block: one point's after the other,
     /// or the columns of a panel.
     whitened: Vec<f64>,
@@ -131,7 +131,7 @@ impl Reduced {
 
     fn subtract(&mut self, pool: &WorkerPool, points: Range<usize>) -> bool {
         let Self { pattern, values, vector, incident_points, whitened, whitened_gradients, .. } = self;
-        let of_batch = |block: usize| incident_points.within(block, &points);
+        let of_batch = |block: usize| within(&incident_points[block], &points);
         let weights = (0..pattern.block_count()).map(|block| of_batch(block).len());
         let (mut values, mut vector) = (values.as_mut_slice(), vector.as_mut_slice());
         let cut = |ends: &[usize]| {
