@@ -8,7 +8,7 @@ use super::super::intrinsics::Parameter;
 use super::super::metric::{POINT, POSE, VIEW};
 use super::super::problem;
 use super::grouped::grouped;
-use super::{CancellationCheck, Free, MetricReconstruction, Observation};
+use super::{Free, MetricReconstruction, Observation};
 
 /// The unknowns of views and groups, in blocks: the free views that see something, then the groups with free
 /// intrinsics.
@@ -116,14 +116,7 @@ pub(super) struct Layout {
 impl Layout {
     /// Observations with an index out of range, a coordinate that is not finite or a weight that is not positive are
     /// left out.
-    ///
-    /// Returns `None` when it was stopped.
-    pub fn new(
-        sequence: &MetricReconstruction,
-        observations: &[Observation],
-        free: &Free,
-        cancellation: &mut CancellationCheck,
-    ) -> Option<Self> {
+    pub fn new(sequence: &MetricReconstruction, observations: &[Observation], free: &Free) -> Self {
         let points = sequence.points.len();
         let is_usable = |seen: &&Observation| {
             let group = sequence.group_of.get(seen.view);
@@ -132,37 +125,29 @@ impl Layout {
         };
         let sorted = problem::Layout::sorted(observations.iter().filter(is_usable).copied().collect(), points);
         let mut sees = vec![false; sequence.poses.len()];
-        let mut seen = Vec::with_capacity(sorted.observations.len());
-        for Observation { view, xy, weight, .. } in sorted.observations {
-            if !cancellation.may_go_on(1) {
-                return None;
-            }
-            sees[view] = true;
-            seen.push(Seen { view, xy, weight, view_coupling: None, group_coupling: None });
-        }
+        sorted.observations.iter().for_each(|seen| sees[seen.view] = true);
+        let unlinked =
+            |Observation { view, xy, weight, .. }| Seen { view, xy, weight, view_coupling: None, group_coupling: None };
         let mut layout = Self {
             unknowns: Unknowns::new(sequence, free, &sees),
-            seen,
+            seen: sorted.observations.into_iter().map(unlinked).collect(),
             seen_starts: sorted.starts,
             incident_blocks: Vec::new(),
             incident_block_starts: vec![0],
             coupling_starts: vec![0],
             free_points: (0..points).map(|point| is_free(free.points, point)).collect(),
         };
-        layout.link_blocks(sequence, cancellation).then_some(layout)
+        layout.link_blocks(sequence);
+        layout
     }
 
-    /// Finds the blocks that each free point is linked with and gives them their places among the couplings; `false`
-    /// when it was stopped.
-    fn link_blocks(&mut self, sequence: &MetricReconstruction, cancellation: &mut CancellationCheck) -> bool {
+    /// Finds the blocks that each free point is linked with and gives them their places among the couplings.
+    fn link_blocks(&mut self, sequence: &MetricReconstruction) {
         let unknowns = &self.unknowns;
         let mut blocks: Vec<usize> = Vec::new();
         let mut couplings = 0;
         for point in 0..self.free_points.len() {
             let seen = &mut self.seen[self.seen_starts[point]..self.seen_starts[point + 1]];
-            if !cancellation.may_go_on(seen.len()) {
-                return false;
-            }
             if self.free_points[point] {
                 let first = self.incident_blocks.len();
                 let view = |seen: &Seen| unknowns.view_block[seen.view];
@@ -191,7 +176,6 @@ impl Layout {
             self.incident_block_starts.push(self.incident_blocks.len());
             self.coupling_starts.push(couplings);
         }
-        true
     }
 
     pub fn point_count(&self) -> usize {

@@ -10,7 +10,7 @@ use super::pattern::Pattern;
 use super::reduced::{Reduced, substitute};
 use super::solver::SparseCholesky;
 use super::worker_pool::WorkerPool;
-use super::{CancellationCheck, Free, MetricReconstruction, Observation, Run};
+use super::{Free, MetricReconstruction, Observation, Run};
 use crate::domain::StopToken;
 use crate::geometry::levenberg_marquardt::{self, LeastSquares, StepCost};
 use crate::parallel::Threads;
@@ -27,9 +27,9 @@ const ITERATE_WITHIN: f64 = 2.0;
 /// The cost contains what the priors of groups with free intrinsics add, and never rises. What is held stays as it is,
 /// to the bit; what is found does not depend on the threads. One iteration costs time linear in the observations times
 /// the length of their tracks, and what the factorisation takes: linear in the views where each is connected with a
-/// bounded number of others. `run.stop` is asked every few milliseconds but not within a factorisation; a stopped,
-/// stuck or degenerate problem keeps its last good state. The costs of one that was stopped before they were known are
-/// infinite.
+/// bounded number of others. `run.stop` is asked every few milliseconds, but not while the observations are sorted nor
+/// within a factorisation; a stopped, stuck or degenerate problem keeps its last good state. The costs of one that was
+/// stopped before they were known are infinite.
 ///
 /// # Pitfall
 /// Points may pass behind a camera on the way: residuals know no cheirality, so check it on the result.
@@ -42,13 +42,11 @@ pub fn adjust(
     run: Run,
 ) -> Report {
     let Run { threads, stop, heartbeat } = run;
-    let mut cancellation = CancellationCheck::new(stop);
-    let unknown = Report::at(f64::INFINITY);
-    let Some(layout) = Layout::new(sequence, observations, free, &mut cancellation) else { return unknown };
+    let layout = Layout::new(sequence, observations, free);
     let pool = WorkerPool::new(&layout, threads, stop);
     let loss = options.loss;
     let solvable = || {
-        let pattern = Pattern::new(sequence, &layout, &mut cancellation)?;
+        let pattern = Pattern::new(sequence, &layout, stop)?;
         let sparse = if pattern.is_square { None } else { Some(SparseCholesky::new(&pattern)?) };
         Some((sparse, pattern))
     };

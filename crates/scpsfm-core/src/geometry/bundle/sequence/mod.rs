@@ -55,33 +55,3 @@ pub struct Run<'a> {
     /// Called after every attempt at a step.
     pub heartbeat: &'a mut dyn FnMut(),
 }
-
-/// Observations' worth of work after which the stop token is asked: some milliseconds, 20 in builds for tests.
-const WORK_BETWEEN_QUESTIONS: usize = 1 << 14;
-
-/// Asks the stop token now and then.
-struct CancellationCheck<'a> {
-    stop: &'a StopToken,
-    left: usize,
-}
-
-impl<'a> CancellationCheck<'a> {
-    fn new(stop: &'a StopToken) -> Self {
-        Self { stop, left: WORK_BETWEEN_QUESTIONS }
-    }
-
-    /// Whether to go on after so much work.
-    #[inline]
-    fn may_go_on(&mut self, work: usize) -> bool {
-        match self.left.checked_sub(work) {
-            Some(left) => {
-                self.left = left;
-                true
-            }
-            None => {
-                self.left = WORK_BETWEEN_QUESTIONS;
-                !self.stop.is_stopped()
-            }
-        }
-    }
-}

@@ -127,7 +127,6 @@ struct Batch<'a> {
     /// Where the batch begins among all observations.
     first: usize,
     rows: &'a [Option<Weighted>],
-    pool: &'a WorkerPool<'a>,
 }
 
 impl Normal {
@@ -154,18 +153,17 @@ impl Normal {
         self.cameras.values.fill(0.0);
         self.cameras.gradient.fill(0.0);
         self.cameras.add_priors(sequence, pool.layout, priors);
-        pool.batches().all(|points| {
-            self.linearise(sequence, loss, pool, points.clone()) && self.cameras.add_batch(pool, points, &self.rows)
-        })
+        for points in pool.batches() {
+            if pool.stop.is_stopped() {
+                return false;
+            }
+            self.linearise(sequence, loss, pool, points.clone());
+            self.cameras.add_batch(pool, points, &self.rows);
+        }
+        true
     }
 
-    fn linearise(
-        &mut self,
-        sequence: &MetricReconstruction,
-        loss: Loss,
-        pool: &WorkerPool,
-        points: Range<usize>,
-    ) -> bool {
+    fn linearise(&mut self, sequence: &MetricReconstruction, loss: Loss, pool: &WorkerPool, points: Range<usize>) {
         let layout = pool.layout;
         let seen = layout.seen_range(points.clone()).len();
         // What is left from another batch is written over before it is read.
@@ -186,23 +184,19 @@ impl Normal {
         pool.threads.each(pieces, |piece: Points| {
             vectorised(
                 #[inline(always)]
-                || piece.linearise(sequence, loss, pool),
-            )
-        })
+                || piece.linearise(sequence, loss, layout),
+            );
+            true
+        });
     }
 }
 
 impl Points<'_> {
-    /// `false` when it was stopped.
     #[inline(always)]
-    fn linearise(self, sequence: &MetricReconstruction, loss: Loss, pool: &WorkerPool) -> bool {
-        let (layout, mut cancellation) = (pool.layout, pool.cancellation());
+    fn linearise(self, sequence: &MetricReconstruction, loss: Loss, layout: &Layout) {
         let (mut rows, mut couplings) = (self.rows, self.couplings);
         for (point, slot) in self.range.zip(self.blocks) {
             let seen = layout.seen(point);
-            if !cancellation.may_go_on(seen.len()) {
-                return false;
-            }
             let mut block = PointBlock::ZERO;
             let couplings = split_off(&mut couplings, layout.couplings(point).len());
             couplings.fill(0.0);
@@ -219,7 +213,6 @@ impl Points<'_> {
             }
             *slot = block;
         }
-        true
     }
 }
 
@@ -265,8 +258,8 @@ impl Cameras {
         }
     }
 
-    /// Adds the rows of a batch; `false` when it was stopped.
-    fn add_batch(&mut self, pool: &WorkerPool, points: Range<usize>, rows: &[Option<Weighted>]) -> bool {
+    /// Adds the rows of a batch.
+    fn add_batch(&mut self, pool: &WorkerPool, points: Range<usize>, rows: &[Option<Weighted>]) {
         let Self { places, values, gradient, before, by_view, .. } = self;
         let layout = pool.layout;
         let seen = layout.seen_range(points);
@@ -284,7 +277,7 @@ impl Cameras {
         let mut pieces: Vec<Sums> = even_cuts(pool.threads.pieces(), weights).windows(2).map(cut).collect();
         // First, for nobody can share it.
         pieces.insert(0, Sums::Groups { values, gradient });
-        let batch = Batch { places, before, first: seen.start, rows, pool };
+        let batch = Batch { places, before, first: seen.start, rows };
         pool.threads.each(pieces, |piece: Sums| {
             vectorised(
                 #[inline(always)]
@@ -294,13 +287,14 @@ impl Cameras {
                         batch.add_to_groups(&layout.all_seen()[seen.clone()], values, gradient)
                     }
                 },
-            )
-        })
+            );
+            true
+        });
     }
 }
 
 impl Batch<'_> {
-    /// Adds to the blocks of a run of views; `false` when it was stopped.
+    /// Adds to the blocks of a run of views.
     ///
     /// * `values`, `gradient`: those of these views
     /// * `seen`: observations of a view in this batch, ascending
@@ -311,17 +305,13 @@ impl Batch<'_> {
         values: &mut [f64],
         gradient: &mut [f64],
         seen: impl Fn(usize) -> &'s [u32],
-    ) -> bool {
-        let mut cancellation = self.pool.cancellation();
+    ) {
         let (first_value, first_unknown) = self.before[views.start];
         let of_views = |place: Place| Place { start: place.start - first_value, ..place };
         for view in views {
             let ViewPlaces { view: Some((first, unknowns, place)), group, cross } = self.places[view] else { continue };
             let gradient = &mut gradient[first - first_unknown..];
             for &k in seen(view) {
-                if !cancellation.may_go_on(1) {
-                    return false;
-                }
                 let Some(row) = &self.rows[k as usize - self.first] else { continue };
                 let own = [&row.view[0][..unknowns], &row.view[1][..unknowns]];
                 add_to_view(values, of_views(place), unknowns, &row.view, own);
@@ -331,27 +321,21 @@ impl Batch<'_> {
                 }
             }
         }
-        true
     }
 
-    /// Adds to the blocks of all groups; `false` when it was stopped.
+    /// Adds to the blocks of all groups.
     ///
     /// * `values`, `gradient`: those of the groups
     /// * `seen`: the observations of the batch
     #[inline(always)]
-    fn add_to_groups(&self, seen: &[Seen], values: &mut [f64], gradient: &mut [f64]) -> bool {
-        let mut cancellation = self.pool.cancellation();
-        let Some(&(first_value, first_unknown)) = self.before.last() else { return true };
+    fn add_to_groups(&self, seen: &[Seen], values: &mut [f64], gradient: &mut [f64]) {
+        let Some(&(first_value, first_unknown)) = self.before.last() else { return };
         for (seen, row) in seen.iter().zip(self.rows) {
-            if !cancellation.may_go_on(1) {
-                return false;
-            }
             let (Some((first, free, place)), Some(row)) = (self.places[seen.view].group, row) else { continue };
             let free = row.by_intrinsics(free);
             add_product(values, Place { start: place.start - first_value, ..place }, free, free);
             add_gradient(&mut gradient[first - first_unknown..], free, row.residual);
         }
-        true
     }
 }
 

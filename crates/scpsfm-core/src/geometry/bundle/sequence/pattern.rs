@@ -1,8 +1,9 @@
 //! Where the blocks of the reduced system are that are not zero.
 
 use super::super::panel::PANEL_SHARE;
+use super::MetricReconstruction;
 use super::layout::{Layout, Unknowns};
-use super::{CancellationCheck, MetricReconstruction};
+use crate::domain::StopToken;
 
 /// Unknowns up to which a system is a square matrix, about forty views: its dense factorisation needs no analysis.
 const SQUARE_LIMIT: usize = 256;
@@ -42,20 +43,16 @@ pub(super) struct Place {
 impl Pattern {
     /// Blocks that a point links, and the pose of every view with the intrinsics of its group; all, in a square matrix,
     /// where they are few or most are linked. `None` when it was stopped.
-    pub fn new(sequence: &MetricReconstruction, layout: &Layout, cancellation: &mut CancellationCheck) -> Option<Self> {
+    pub fn new(sequence: &MetricReconstruction, layout: &Layout, stop: &StopToken) -> Option<Self> {
         let limit = if layout.coupled_share() >= PANEL_SHARE { SQUARE_LIMIT_OF_COUPLED } else { SQUARE_LIMIT };
         if layout.unknowns.count() <= limit {
             return Some(Self::square(&layout.unknowns));
         }
-        Self::sparse(sequence, layout, cancellation)
+        Self::sparse(sequence, layout, stop)
     }
 
     /// Without the blocks that are zero; `None` when it was stopped.
-    pub fn sparse(
-        sequence: &MetricReconstruction,
-        layout: &Layout,
-        cancellation: &mut CancellationCheck,
-    ) -> Option<Self> {
+    pub fn sparse(sequence: &MetricReconstruction, layout: &Layout, stop: &StopToken) -> Option<Self> {
         let unknowns = &layout.unknowns;
         let blocks = unknowns.block_count();
         let mut group_of = vec![None; blocks];
@@ -67,6 +64,9 @@ impl Pattern {
         // Column for which a row was listed last.
         let mut listed_for = vec![usize::MAX; blocks];
         for (column, group) in group_of.into_iter().enumerate() {
+            if stop.is_stopped() {
+                return None;
+            }
             let first = rows.len();
             let mut list = |row: usize| {
                 if row >= column && listed_for[row] != column {
@@ -77,12 +77,7 @@ impl Pattern {
             list(column);
             group.into_iter().for_each(&mut list);
             for &point in &points_by_block[column] {
-                let incident_blocks = layout.incident_blocks(point as usize);
-                // A look at a block costs a small part of what an observation's linearisation does.
-                if !cancellation.may_go_on(incident_blocks.len().div_ceil(8)) {
-                    return None;
-                }
-                incident_blocks.iter().for_each(|incident| list(incident.block as usize));
+                layout.incident_blocks(point as usize).iter().for_each(|incident| list(incident.block as usize));
             }
             rows[first..].sort_unstable();
             column_starts.push(rows.len());

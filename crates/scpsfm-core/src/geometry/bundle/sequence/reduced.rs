@@ -77,13 +77,17 @@ impl Reduced {
         for (slot, gradient) in self.vector.iter_mut().zip(&normal.cameras.gradient) {
             *slot = -gradient;
         }
-        pool.batches().all(|points| {
-            self.whiten(normal, damping, pool, points.clone())
-                && match self.by_panels {
-                    true => self.subtract_panel(pool, points),
-                    false => self.subtract(pool, points),
-                }
-        })
+        for points in pool.batches() {
+            if pool.stop.is_stopped() || !self.whiten(normal, damping, pool, points.clone()) {
+                return false;
+            }
+            if self.by_panels {
+                self.subtract_panel(pool, points);
+            } else if !self.subtract(pool, points) {
+                return false;
+            }
+        }
+        true
     }
 
     fn whiten(&mut self, normal: &Normal, damping: f64, pool: &WorkerPool, points: Range<usize>) -> bool {
@@ -107,26 +111,22 @@ impl Reduced {
         pool.threads.each(pieces, |piece: Points| {
             vectorised(
                 #[inline(always)]
-                || piece.whiten(normal, damping, pattern, by_panels, pool),
+                || piece.whiten(normal, damping, pattern, by_panels, layout),
             )
         })
     }
 
-    /// Takes from the system what the points of a batch subtract, as columns of a panel; `false` when it was stopped.
-    fn subtract_panel(&mut self, pool: &WorkerPool, points: Range<usize>) -> bool {
+    /// Takes from the system what the points of a batch subtract, as columns of a panel.
+    fn subtract_panel(&mut self, pool: &WorkerPool, points: Range<usize>) {
         let rows = self.pattern.dimension();
         let first = points.start;
         let coupled = points.filter(|point| pool.layout.is_coupled(*point)).map(|point| point - first);
-        if !pool.cancellation().may_go_on(1) {
-            return false;
-        }
         let whitened = &self.whitened[..POINT * rows * coupled.clone().count()];
         panel::subtract(whitened, rows, &mut self.values);
         let gradients = coupled.flat_map(|point| self.whitened_gradients[point].iter());
         for (column, gradient) in whitened.chunks_exact(rows.max(1)).zip(gradients) {
             self.vector.iter_mut().zip(column).for_each(|(slot, value)| *slot += value * gradient);
         }
-        true
     }
 
     fn subtract(&mut self, pool: &WorkerPool, points: Range<usize>) -> bool {
@@ -178,10 +178,9 @@ impl Reduced {
 }
 
 impl Points<'_> {
-    /// `false` when a block cannot be factored, or it was stopped.
+    /// `false` when a block cannot be factored.
     #[inline(always)]
-    fn whiten(self, normal: &Normal, damping: f64, pattern: &Pattern, by_panels: bool, pool: &WorkerPool) -> bool {
-        let (layout, mut cancellation) = (pool.layout, pool.cancellation());
+    fn whiten(self, normal: &Normal, damping: f64, pattern: &Pattern, by_panels: bool, layout: &Layout) -> bool {
         let mut whitened = self.whitened;
         for (point, whitened_gradient) in self.range.zip(self.whitened_gradients) {
             let incident_blocks = layout.incident_blocks(point);
@@ -195,9 +194,6 @@ impl Points<'_> {
             };
             if by_panels {
                 whitened.fill(0.0);
-            }
-            if !cancellation.may_go_on(incident_blocks.len()) {
-                return false;
             }
             let block = &normal.points[point];
             let Some(factor) = block.factor(damping) else { return false };
@@ -235,18 +231,17 @@ impl Columns<'_> {
         incident_points: impl Fn(usize) -> &'t [u32],
         pool: &WorkerPool,
     ) -> bool {
-        let (layout, mut cancellation) = (pool.layout, pool.cancellation());
+        let layout = pool.layout;
         let (first_value, first_unknown) =
             (pattern.panels(self.range.clone()).start, pattern.offsets[self.range.start]);
         for column in self.range {
+            if pool.stop.is_stopped() {
+                return false;
+            }
             let (size, stride) = (pattern.size(column), pattern.stride(column));
             let vector = &mut self.vector[pattern.offsets[column] - first_unknown..][..size];
             for point in incident_points(column).iter().map(|&point| point as usize) {
                 let incident_blocks = layout.incident_blocks(point);
-                // Pairs cost what a sixth of an observation's linearisation does.
-                if !cancellation.may_go_on(incident_blocks.len().div_ceil(6)) {
-                    return false;
-                }
                 let Ok(first) = incident_blocks.binary_search_by_key(&(column as u32), |incident| incident.block)
                 else {
                     continue;

@@ -3,21 +3,23 @@
 
 use std::ops::Range;
 
-use super::CancellationCheck;
 use super::layout::Layout;
 use crate::domain::StopToken;
 use crate::parallel::{Threads, even_cuts};
 
 /// Observations from which a second thread is worth its beginning: their linearisation takes a millisecond.
 const WORTH_A_THREAD: usize = 4_096;
-/// Observations of a batch: bounds the rows of the Jacobian that are held at once, 270 bytes each, to some 4 MB.
+/// Observations of a batch: bounds the rows of the Jacobian that are held at once, 270 bytes each, to some 4 MB, and
+/// the time between two looks at the stop token to some milliseconds, 20 in builds for tests.
 pub(super) const BATCH: usize = 16_384;
+/// Points between two looks at the stop token where points are worked on one by one.
+const POINTS_BETWEEN_QUESTIONS: usize = 128;
 
 /// The threads of an adjustment, and the cuts of its points.
 pub(super) struct WorkerPool<'a> {
     pub layout: &'a Layout,
     pub threads: Threads,
-    stop: &'a StopToken,
+    pub stop: &'a StopToken,
     /// First points of the batches, and the end.
     batches: Vec<usize>,
 }
@@ -37,11 +39,6 @@ impl<'a> WorkerPool<'a> {
         Self { layout, threads: threads.if_worth(observations >= WORTH_A_THREAD), stop, batches }
     }
 
-    /// For one piece of work: asks the stop token at once, and then now and then.
-    pub fn cancellation(&self) -> CancellationCheck<'a> {
-        CancellationCheck { stop: self.stop, left: 0 }
-    }
-
     /// The points in runs that are worked on one after the other.
     pub fn batches(&self) -> impl Iterator<Item = Range<usize>> {
         self.batches.windows(2).map(|ends| ends[0]..ends[1])
@@ -56,13 +53,12 @@ impl<'a> WorkerPool<'a> {
 
     /// What `work` makes of every point, in their order; `None` where it made nothing of one, or it was stopped.
     pub fn of_points<T: Send>(&self, work: impl Fn(usize) -> Option<T> + Sync) -> Option<Vec<T>> {
-        let layout = self.layout;
-        let cuts = self.cut(0..layout.point_count());
-        let of_piece = |piece: usize| -> Option<Vec<T>> {
-            let mut cancellation = self.cancellation();
-            let points = cuts[piece]..cuts[piece + 1];
-            points.map(|point| work(point).filter(|_| cancellation.may_go_on(layout.seen(point).len()))).collect()
+        let cuts = self.cut(0..self.layout.point_count());
+        let of_point = |point: usize| {
+            let is_stopped = point.is_multiple_of(POINTS_BETWEEN_QUESTIONS) && self.stop.is_stopped();
+            if is_stopped { None } else { work(point) }
         };
+        let of_piece = |piece: usize| (cuts[piece]..cuts[piece + 1]).map(of_point).collect::<Option<Vec<T>>>();
         let pieces = self.threads.map(cuts.len() - 1, 1, of_piece, &mut |_| ());
         let pieces: Vec<Vec<T>> = pieces.into_iter().collect::<Option<_>>()?;
         Some(pieces.into_iter().flatten().collect())

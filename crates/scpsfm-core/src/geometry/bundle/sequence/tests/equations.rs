@@ -2,7 +2,6 @@
 
 use nalgebra::{DMatrix, DVector};
 
-use super::super::CancellationCheck;
 use super::super::layout::Layout;
 use super::super::minimise::retract;
 use super::super::normal::Normal;
@@ -35,10 +34,8 @@ fn mixed() -> (MetricReconstruction, Vec<Observation>, Vec<IntrinsicsModel>, Vec
 }
 
 fn laid_out(sequence: &MetricReconstruction, observations: &[Observation], free: &Free) -> (Layout, Pattern) {
-    let going = StopToken::default();
-    let mut cancellation = CancellationCheck::new(&going);
-    let layout = Layout::new(sequence, observations, free, &mut cancellation).expect("goes on");
-    let pattern = Pattern::new(sequence, &layout, &mut cancellation).expect("goes on");
+    let layout = Layout::new(sequence, observations, free);
+    let pattern = Pattern::new(sequence, &layout, &StopToken::default()).expect("goes on");
     (layout, pattern)
 }
 
@@ -102,15 +99,14 @@ fn every_layout_of_the_system_is_the_same_system() {
     observations.retain(|seen| (seen.point + seen.view) % 7 != 0 && seen.point != 5);
     observations.push(observations[0]);
     let stop = StopToken::default();
-    let mut cancellation = CancellationCheck::new(&stop);
     let models = [IntrinsicsModel::FOCAL];
-    let layout = Layout::new(&sequence, &observations, &Free::all(&models), &mut cancellation).expect("goes on");
+    let layout = Layout::new(&sequence, &observations, &Free::all(&models));
     let pool = WorkerPool::new(&layout, Threads::ONE, &stop);
     let mut built = Vec::new();
     for by_panels in [None, Some(false), Some(true)] {
         let pattern = match by_panels {
-            None => Pattern::sparse(&sequence, &layout, &mut cancellation),
-            Some(_) => Pattern::new(&sequence, &layout, &mut cancellation),
+            None => Pattern::sparse(&sequence, &layout, &stop),
+            Some(_) => Pattern::new(&sequence, &layout, &stop),
         };
         let pattern = pattern.expect("goes on");
         assert_eq!(pattern.is_square, by_panels.is_some());

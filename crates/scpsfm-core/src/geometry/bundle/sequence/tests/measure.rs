@@ -3,7 +3,6 @@
 
 use std::time::Instant;
 
-use super::super::CancellationCheck;
 use super::super::layout::Layout;
 use super::super::pattern::Pattern;
 use super::super::solver::SparseCholesky;
@@ -37,11 +36,9 @@ fn time_against_observations() {
             let mut start = perturbed(&truth, 0.002, 1);
             let models = vec![IntrinsicsModel::FOCAL; truth.intrinsics.len()];
             let stop = StopToken::default();
-            let mut cancellation = CancellationCheck::new(&stop);
-            let (layout_seconds, layout) =
-                timed(|| Layout::new(&truth, &observations, &Free::all(&models), &mut cancellation).expect("goes on"));
+            let (layout_seconds, layout) = timed(|| Layout::new(&truth, &observations, &Free::all(&models)));
             let (analysis_seconds, _) = timed(|| {
-                let pattern = Pattern::new(&truth, &layout, &mut cancellation).expect("goes on");
+                let pattern = Pattern::new(&truth, &layout, &stop).expect("goes on");
                 (!pattern.is_square).then(|| SparseCholesky::new(&pattern).expect("memory"))
             });
             drop(layout);
