@@ -104,14 +104,6 @@ pub(super) struct Normal {
     rows: Vec<Option<Weighted>>,
 }
 
-/// Some points of a batch, to be linearised.
-struct Points<'a> {
-    range: Range<usize>,
-    rows: &'a mut [Option<Weighted>],
-    couplings: &'a mut [f64],
-    blocks: &'a mut [PointBlock],
-}
-
 /// What the rows of a batch are added to.
 enum Sums<'a> {
     /// Blocks of some views and theirs with the intrinsics.
@@ -163,6 +155,7 @@ impl Normal {
         true
     }
 
+    /// Rows of the Jacobian of a batch of points, and the points' own blocks and couplings.
     fn linearise(&mut self, sequence: &MetricReconstruction, loss: Loss, pool: &WorkerPool, points: Range<usize>) {
         let layout = pool.layout;
         let seen = layout.seen_range(points.clone()).len();
@@ -173,46 +166,38 @@ impl Normal {
         let mut blocks = &mut self.points[points.clone()];
         let cut = |ends: &[usize]| {
             let range = ends[0]..ends[1];
-            Points {
-                rows: split_off(&mut rows, layout.seen_range(range.clone()).len()),
-                couplings: split_off(&mut couplings, layout.couplings_of(range.clone()).len()),
-                blocks: split_off(&mut blocks, range.len()),
-                range,
-            }
+            let rows = split_off(&mut rows, layout.seen_range(range.clone()).len());
+            let couplings = split_off(&mut couplings, layout.couplings_of(range.clone()).len());
+            let blocks = split_off(&mut blocks, range.len());
+            (range, rows, couplings, blocks)
         };
         let pieces = pool.cut(points).windows(2).map(cut).collect();
-        pool.threads.each(pieces, |piece: Points| {
+        pool.threads.each(pieces, |(points, mut rows, mut couplings, blocks)| {
             vectorised(
                 #[inline(always)]
-                || piece.linearise(sequence, loss, layout),
+                || {
+                    for (point, slot) in points.zip(blocks) {
+                        let seen = layout.seen(point);
+                        let mut block = PointBlock::ZERO;
+                        let couplings = split_off(&mut couplings, layout.couplings(point).len());
+                        couplings.fill(0.0);
+                        for (seen, slot) in seen.iter().zip(split_off(&mut rows, seen.len())) {
+                            let parameters = &layout.unknowns.parameters[sequence.group_of[seen.view]];
+                            *slot = Weighted::new(sequence, &sequence.points[point], seen, parameters, loss);
+                            if let Some(row) = slot {
+                                block.add(&row.point, row.residual);
+                                row.link_blocks(seen, layout.unknowns.of_view(seen.view), parameters.len(), couplings);
+                            }
+                        }
+                        if sequence.has_common_centre {
+                            block.hold_length(&sequence.points[point]);
+                        }
+                        *slot = block;
+                    }
+                },
             );
             true
         });
-    }
-}
-
-impl Points<'_> {
-    #[inline(always)]
-    fn linearise(self, sequence: &MetricReconstruction, loss: Loss, layout: &Layout) {
-        let (mut rows, mut couplings) = (self.rows, self.couplings);
-        for (point, slot) in self.range.zip(self.blocks) {
-            let seen = layout.seen(point);
-            let mut block = PointBlock::ZERO;
-            let couplings = split_off(&mut couplings, layout.couplings(point).len());
-            couplings.fill(0.0);
-            for (seen, slot) in seen.iter().zip(split_off(&mut rows, seen.len())) {
-                let parameters = &layout.unknowns.parameters[sequence.group_of[seen.view]];
-                *slot = Weighted::new(sequence, &sequence.points[point], seen, parameters, loss);
-                if let Some(row) = slot {
-                    block.add(&row.point, row.residual);
-                    row.link_blocks(seen, layout.unknowns.of_view(seen.view), parameters.len(), couplings);
-                }
-            }
-            if sequence.has_common_centre {
-                block.hold_length(&sequence.points[point]);
-            }
-            *slot = block;
-        }
     }
 }
 

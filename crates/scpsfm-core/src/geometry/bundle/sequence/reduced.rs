@@ -41,13 +41,6 @@ pub(super) struct Reduced {
     pub by_panels: bool,
 }
 
-/// Some points of a batch, to be whitened.
-struct Points<'a> {
-    range: Range<usize>,
-    whitened: &'a mut [f64],
-    whitened_gradients: &'a mut [Vector3<f64>],
-}
-
 /// Some block columns of the system, for a batch to be subtracted from.
 struct Columns<'a> {
     range: Range<usize>,
@@ -90,6 +83,7 @@ impl Reduced {
         true
     }
 
+    /// Whitens the couplings and gradients of a batch of points; `false` when a block cannot be factored.
     fn whiten(&mut self, normal: &Normal, damping: f64, pool: &WorkerPool, points: Range<usize>) -> bool {
         let (layout, by_panels, rows) = (pool.layout, self.by_panels, self.pattern.dimension());
         let length = |points: Range<usize>| match by_panels {
@@ -104,14 +98,39 @@ impl Reduced {
         let cut = |ends: &[usize]| {
             let range = ends[0]..ends[1];
             let whitened = split_off(&mut whitened, length(range.clone()));
-            Points { whitened_gradients: split_off(&mut whitened_gradients, range.len()), range, whitened }
+            let whitened_gradients = split_off(&mut whitened_gradients, range.len());
+            (range, whitened, whitened_gradients)
         };
         let pieces = pool.cut(points).windows(2).map(cut).collect();
         let pattern = &self.pattern;
-        pool.threads.each(pieces, |piece: Points| {
+        pool.threads.each(pieces, |(points, mut whitened, whitened_gradients)| {
             vectorised(
                 #[inline(always)]
-                || piece.whiten(normal, damping, pattern, by_panels, layout),
+                || {
+                    for (point, whitened_gradient) in points.zip(whitened_gradients) {
+                        let incident_blocks = layout.incident_blocks(point);
+                        if incident_blocks.is_empty() {
+                            continue;
+                        }
+                        let couplings = &normal.couplings[layout.couplings(point)];
+                        let whitened = split_off(&mut whitened, length(point..point + 1));
+                        if by_panels {
+                            whitened.fill(0.0);
+                        }
+                        let block = &normal.points[point];
+                        let Some(factor) = block.factor(damping) else { return false };
+                        *whitened_gradient = factor.whiten(&block.gradient);
+                        for incident in incident_blocks {
+                            let (block, start) = (incident.block as usize, incident.coupling as usize);
+                            let size = pattern.size(block);
+                            let coupling = &couplings[start..start + POINT * size];
+                            let (place, stride) =
+                                if by_panels { (pattern.offsets[block], rows) } else { (start, size) };
+                            factor.whiten_coupling(coupling, &mut whitened[place..], stride);
+                        }
+                    }
+                    true
+                },
             )
         })
     }
@@ -174,39 +193,6 @@ impl Reduced {
             None => cholesky::solve(&mut self.values, &mut self.vector),
         };
         is_solved && self.vector.iter().all(|value| value.is_finite())
-    }
-}
-
-impl Points<'_> {
-    /// `false` when a block cannot be factored.
-    #[inline(always)]
-    fn whiten(self, normal: &Normal, damping: f64, pattern: &Pattern, by_panels: bool, layout: &Layout) -> bool {
-        let mut whitened = self.whitened;
-        for (point, whitened_gradient) in self.range.zip(self.whitened_gradients) {
-            let incident_blocks = layout.incident_blocks(point);
-            if incident_blocks.is_empty() {
-                continue;
-            }
-            let couplings = &normal.couplings[layout.couplings(point)];
-            let whitened = match by_panels {
-                true => split_off(&mut whitened, POINT * pattern.dimension()),
-                false => split_off(&mut whitened, couplings.len()),
-            };
-            if by_panels {
-                whitened.fill(0.0);
-            }
-            let block = &normal.points[point];
-            let Some(factor) = block.factor(damping) else { return false };
-            *whitened_gradient = factor.whiten(&block.gradient);
-            for incident in incident_blocks {
-                let (block, start) = (incident.block as usize, incident.coupling as usize);
-                let size = pattern.size(block);
-                let (place, stride) =
-                    if by_panels { (pattern.offsets[block], pattern.dimension()) } else { (start, size) };
-                factor.whiten_coupling(&couplings[start..start + POINT * size], &mut whitened[place..], stride);
-            }
-        }
-        true
     }
 }
 
