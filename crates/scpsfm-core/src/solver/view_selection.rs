@@ -58,47 +58,13 @@ pub fn candidate_views(problem: &Problem) -> Vec<Vec<usize>> {
     whole(problem).map_or_else(among_all, |views| vec![views])
 }
 
-/// Sets of views that a reconstruction may begin with, best first: those of one camera, then those of several together.
-/// Of cameras that took pictures in turn, one alone sees short tracks half as often.
-///
-/// At most [`ViewSelectionOptions::most_blocks`] of either.
-pub fn blocks(problem: &Problem) -> Vec<Vec<usize>> {
-    if problem.cameras == 1 {
-        return candidate_views(problem);
-    }
-    let mut found = candidate_views_of_one_camera(problem);
-    for views in candidate_views(problem) {
-        if !found.contains(&views) {
-            found.push(views);
-        }
-    }
-    found
-}
-
 /// The views of the one block of an input whose tracks are complete; see [`complete_views`].
 pub fn whole(problem: &Problem) -> Option<Vec<usize>> {
     complete_views(problem.input, &problem.ranges).map(|views| evenly(&views, OPTIONS.most_views_whole))
 }
 
-/// The same of incomplete tracks, each set of one camera: those of the camera with most observations first.
-fn candidate_views_of_one_camera(problem: &Problem) -> Vec<Vec<usize>> {
-    let mut observed = vec![0usize; problem.cameras];
-    problem.of_view.iter().zip(&problem.camera_of).for_each(|(seen, &camera)| observed[camera] += seen.len());
-    let mut order: Vec<usize> = (0..problem.cameras).collect();
-    order.sort_by_key(|&camera| (Reverse(observed[camera]), camera));
-    let mut found: Vec<Vec<usize>> = Vec::new();
-    for camera in order {
-        let open: Vec<bool> = problem.camera_of.iter().map(|of| *of == camera).collect();
-        let enough = open.iter().filter(|&&open| open).count() >= LEAST_VIEWS;
-        if enough && found.len() < OPTIONS.most_blocks && !problem.stop.is_stopped() {
-            found.extend(candidate_views_among(problem, &open));
-        }
-    }
-    found.truncate(OPTIONS.most_blocks);
-    found
-}
-
-/// The same of incomplete tracks, only of views that are `open` (one entry a view).
+/// The same of incomplete tracks, only of views that are `open` (one entry a view); at most
+/// [`ViewSelectionOptions::most_blocks`].
 pub fn candidate_views_among(problem: &Problem, open: &[bool]) -> Vec<Vec<usize>> {
     let found = [OPTIONS.wanted_tracks, LEAST_INLIERS].into_iter().map(|least| greedy_views(problem, open, least));
     found.into_iter().find(|found| !found.is_empty()).unwrap_or_default()
@@ -289,22 +255,6 @@ mod tests {
         assert_eq!((sampled.tracks.len(), sampled.complete.tracks()), (7, 7));
         let place = block.tracks.iter().position(|&track| track == sampled.tracks[3]).expect("a track of the block");
         assert_eq!(sampled.complete.point(2, 3), block.complete.point(2, place));
-    }
-
-    /// Two cameras that took pictures in turn, of tracks of seven views: either sees three or four of these.
-    #[test]
-    fn blocks_of_one_camera_come_before_those_of_several() {
-        let tracks: Vec<Vec<usize>> = (0..60).map(|track| (track % 6..track % 6 + 7).collect()).collect();
-        let mut raw = input(12, &tracks).to_raw();
-        raw.views.iter_mut().enumerate().for_each(|(view, of)| of.camera_group = 3 + view as u32 % 2);
-        let input = Input::new(raw, &Limits::default(), "test").expect("valid");
-        let (found, cameras) = with_problem(&input, |problem| {
-            let found = blocks(problem);
-            let cameras: Vec<usize> = found.iter().map(|views| problem.cameras_of(views).1.len()).collect();
-            (found, cameras)
-        });
-        assert!(cameras.contains(&1) && cameras.contains(&2) && cameras.is_sorted(), "{cameras:?} of {found:?}");
-        assert!((1..found.len()).all(|k| !found[..k].contains(&found[k])), "{found:?}");
     }
 
     #[test]

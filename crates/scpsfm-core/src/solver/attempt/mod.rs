@@ -207,18 +207,9 @@ fn are_mixed(mut squared: Vec<f64>) -> bool {
 }
 
 /// Solves a block, or as many of its tracks as its method can afford.
-///
-/// * `priors`: what is known of the focal length of each camera instead of what its views bring: what another part of the
-///   input said; nothing of a camera beyond the slice
-pub fn solve_block(
-    problem: &Problem,
-    block: Block,
-    effort: Effort,
-    priors: &[Option<FocalPrior>],
-    recorder: &mut Recorder,
-) -> Result<Attempt, Error> {
+pub fn solve_block(problem: &Problem, block: Block, effort: Effort, recorder: &mut Recorder) -> Result<Attempt, Error> {
     let mut attempt = search_block(problem, block, effort, recorder)?;
-    calibrate(problem, &mut attempt, priors, recorder)?;
+    calibrate(problem, &mut attempt, recorder)?;
     Ok(attempt)
 }
 
@@ -230,7 +221,7 @@ pub fn solve_densest(problem: &Problem, recorder: &mut Recorder) -> Result<Optio
     for (k, views) in candidates.iter().enumerate() {
         problem.stopped()?;
         recorder.begin_block(k, candidates.len());
-        let attempt = solve_block(problem, problem.block(views), Effort::default(), &[], recorder)?;
+        let attempt = solve_block(problem, problem.block(views), Effort::default(), recorder)?;
         if best.as_ref().is_none_or(|best| attempt.merit() > best.merit()) {
             best = Some(attempt);
         }
@@ -271,12 +262,7 @@ pub fn search_block(
 
 /// Calibrates what stands of an attempt. Behind an undone lens a camera that did not turn gets the focal length of the
 /// lens: an extension, which adjusts it in the images, asks whether it holds.
-pub fn calibrate(
-    problem: &Problem,
-    attempt: &mut Attempt,
-    priors: &[Option<FocalPrior>],
-    recorder: &mut Recorder,
-) -> Result<(), Error> {
+pub fn calibrate(problem: &Problem, attempt: &mut Attempt, recorder: &mut Recorder) -> Result<(), Error> {
     let Some(projective) = &attempt.projective else { return Ok(()) };
     recorder.enter(Stage::Calibrate);
     attempt.calibration = Some(match (&attempt.found.verified_by, &attempt.found.consensus) {
@@ -284,13 +270,13 @@ pub fn calibrate(
             depths::calibrate(problem, &attempt.block.complete, consensus, *focal)
         }
         _ => {
-            let known = |camera: usize| priors.get(camera).copied().flatten().or(problem.focal_priors[camera]);
-            let found = calibrate_projective(problem, projective, known)?;
+            let found = calibrate_projective(problem, projective, &problem.focal_priors)?;
             let did_not_turn = found.warnings.iter().any(|warning| warning.code == WarningCode::PureTranslation);
             match problem.undone.as_ref().filter(|_| did_not_turn && !problem.has_own_focals()) {
                 Some(undone) => {
                     let of_lenses = undone.focal_priors(problem.scale_px, OPTIONS.undone_sigma);
-                    calibrate_projective(problem, projective, |camera| known(camera).or(of_lenses[camera]))?
+                    let known = problem.focal_priors.iter().zip(of_lenses).map(|(known, of_lens)| known.or(of_lens));
+                    calibrate_projective(problem, projective, &known.collect::<Vec<_>>())?
                 }
                 None => found,
             }
@@ -433,16 +419,16 @@ fn decided(problem: &Problem, block: Block, recorder: &mut Recorder) -> Result<A
 
 /// Calibrates from a reconstruction, or as much of it as a calibration takes; the worst of its cameras.
 ///
-/// * `known`: what is known of the focal length of a camera beforehand
+/// * `known`: what is known of the focal length of each camera beforehand
 fn calibrate_projective(
     problem: &Problem,
     projective: &ProjectiveReconstruction,
-    known: impl Fn(usize) -> Option<FocalPrior>,
+    known: &[Option<FocalPrior>],
 ) -> Result<Outcome, Error> {
     let most = OPTIONS.most_calibrated.min(OPTIONS.calibrated_observations / projective.views.len().max(1));
     let some = projective.most_observed(most);
     let (group_of, cameras) = problem.cameras_of(&projective.views);
-    let focal_priors: Vec<Option<FocalPrior>> = cameras.iter().copied().map(known).collect();
+    let focal_priors: Vec<Option<FocalPrior>> = cameras.iter().map(|&camera| known[camera]).collect();
     let to_calibrate = calibration::Uncalibrated {
         cameras: &some.cameras,
         points: &some.points,

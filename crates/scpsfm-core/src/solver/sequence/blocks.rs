@@ -28,7 +28,7 @@ impl Blocks {
     pub fn of(problem: &Problem) -> Self {
         match view_selection::whole(problem) {
             Some(whole) => Self { sets: vec![whole], is_whole: true },
-            None => Self { sets: view_selection::blocks(problem), is_whole: false },
+            None => Self { sets: view_selection::candidate_views(problem), is_whole: false },
         }
     }
 
@@ -67,7 +67,7 @@ fn of_whole(problem: &Problem, views: &[usize], is_quick: bool, recorder: &mut R
     if views.len() < problem.observed_views().len() || !attempt.judges_observations() {
         extend_projectively(problem, &mut attempt, true, recorder)?;
     }
-    attempt::calibrate(problem, &mut attempt, &[], recorder)?;
+    attempt::calibrate(problem, &mut attempt, recorder)?;
     Ok(attempt)
 }
 
@@ -83,14 +83,8 @@ fn by_calibrated_blocks(
     recorder.expect_extension();
     for (k, views) in candidates.iter().enumerate() {
         problem.stopped()?;
-        // A block of several cameras determines each of them less well than one of its own.
-        let is_of_one = |views: &[usize]| problem.cameras_of(views).1.len() == 1;
-        let begun = best.as_ref().filter(|best| best.is_calibrated(problem));
-        if !is_of_one(views) && begun.is_some_and(|best| is_of_one(&best.seed.block.views)) {
-            continue;
-        }
         recorder.begin_block(k, candidates.len());
-        let attempt = attempt::solve_block(problem, problem.block(views), effort, &[], recorder)?;
+        let attempt = attempt::solve_block(problem, problem.block(views), effort, recorder)?;
         if attempt.is_good() {
             let extended = extend(problem, attempt, recorder)?;
             if !extended.stands() {

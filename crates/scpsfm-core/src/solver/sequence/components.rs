@@ -2,11 +2,11 @@
 //! calibration.
 
 use super::growth::Trial;
-use super::model::{FIRST, Lens, Model};
+use super::model::{FIRST, Model};
 use super::options::{ComponentOptions, GrowthOptions};
 use super::triplets::Pairs;
 use super::{merging, register, structure};
-use crate::domain::{FocalPrior, Grade};
+use crate::domain::Grade;
 use crate::geometry::bundle::metric::Intrinsics;
 use crate::solver::attempt::{self, Attempt};
 use crate::solver::calibration::Outcome;
@@ -38,27 +38,28 @@ pub fn first(problem: &Problem, seed: &Attempt, recorder: &mut Recorder) -> Mode
 }
 
 /// Solves and extends what may be a component, one after the other, as long as there is any among the views that are
-/// left: blocks of one camera, then of several together, then triplets.
+/// left: blocks, then triplets.
 pub fn others(
     problem: &Problem,
     model: &mut Model,
-    seed: &Attempt,
     trials: &mut [Trial],
     recorder: &mut Recorder,
 ) -> Result<(), Error> {
     let mut component = FIRST;
     let mut pairs = Pairs::new(problem);
-    for kind in [SeedKind::OfOneCamera, SeedKind::OfSeveral, SeedKind::Triplet] {
+    for next_seed in [next_block, next_triplet] {
         let mut open: Vec<bool> = model.poses.iter().map(Option::is_none).collect();
         let mut failures = 0;
         while component + 1 < OPTIONS.most_components && failures < OPTIONS.most_failures {
             problem.stopped()?;
-            let Some(seed_views) = next_seed(problem, &open, kind) else { break };
+            if open.iter().filter(|open| **open).count() < consensus::LEAST_VIEWS {
+                break;
+            }
+            let Some(seed_views) = next_seed(problem, &open) else { break };
             component += 1;
             recorder.begin_component(component);
-            let priors = priors(problem, seed, model);
             let mut attempt = pairs.search(&seed_views, SEED, recorder)?;
-            attempt::calibrate(problem, &mut attempt, &priors, recorder)?;
+            attempt::calibrate(problem, &mut attempt, recorder)?;
             recorder.end_component();
             // Whatever comes of it, it is tried once.
             attempt.block.views.iter().for_each(|&view| open[view] = false);
@@ -122,51 +123,14 @@ pub fn join_rest(
     Ok(())
 }
 
-/// What a component begins from.
-#[derive(Debug, Clone, Copy)]
-enum SeedKind {
-    /// A block of the views of one camera.
-    OfOneCamera,
-    /// A block of several cameras.
-    OfSeveral,
-    /// Three views that share tracks in pairs.
-    Triplet,
+/// The best block of open views.
+fn next_block(problem: &Problem, open: &[bool]) -> Option<SeedViews> {
+    view_selection::candidate_views_among(problem, open).into_iter().next().map(SeedViews::Block)
 }
 
-/// The best seed of this kind among open views.
-fn next_seed(problem: &Problem, open: &[bool], kind: SeedKind) -> Option<SeedViews> {
-    let is_worth = |open: &[bool]| {
-        open.iter().filter(|open| **open).count() >= consensus::LEAST_VIEWS && !problem.stop.is_stopped()
-    };
-    let block_among = |open: &[bool]| {
-        let found = || view_selection::candidate_views_among(problem, open).into_iter().next();
-        is_worth(open).then(found).flatten().map(SeedViews::Block)
-    };
-    match kind {
-        SeedKind::OfOneCamera => (0..problem.cameras).find_map(|camera| {
-            let is_open = |(open, of): (&bool, &usize)| *open && *of == camera;
-            block_among(&open.iter().zip(&problem.camera_of).map(is_open).collect::<Vec<bool>>())
-        }),
-        // Of one camera there are no blocks of several.
-        SeedKind::OfSeveral => (problem.cameras > 1).then(|| block_among(open)).flatten(),
-        SeedKind::Triplet => {
-            let found = || view_selection::triplets(problem, open).into_iter().next();
-            is_worth(open).then(found).flatten().map(SeedViews::Triplet)
-        }
-    }
-}
-
-/// What the components that stand say of the focal length of each camera that they have; nothing where views have their
-/// own.
-fn priors(problem: &Problem, seed: &Attempt, model: &Model) -> Vec<Option<FocalPrior>> {
-    let calibration = seed.calibration.as_ref().filter(|_| !problem.has_own_focals());
-    let of_camera = |lens: &Lens| {
-        let calibration = calibration.filter(|_| lens.is_known)?;
-        let sigma = calibration.sigma_log_focal.filter(|_| calibration.grade != Grade::ProjectiveOnly);
-        let sigma_log = sigma.map_or(OPTIONS.vague_sigma, |sigma| sigma.max(OPTIONS.prior_sigma));
-        Some(FocalPrior { focal_px: lens.intrinsics.focal * problem.scale_px, sigma_log })
-    };
-    model.lenses.iter().map(of_camera).collect()
+/// The best triplet of open views.
+fn next_triplet(problem: &Problem, open: &[bool]) -> Option<SeedViews> {
+    view_selection::triplets(problem, open).into_iter().next().map(SeedViews::Triplet)
 }
 
 /// Takes back the views of a component that see too few of its points to be held by them, and the whole component if

@@ -144,7 +144,7 @@ pub fn finished(problem: &Problem, mut attempt: Attempt, recorder: &mut Recorder
     }
     if !attempt.has_metric() {
         extend_projectively(problem, &mut attempt, true, recorder)?;
-        attempt::calibrate(problem, &mut attempt, &[], recorder)?;
+        attempt::calibrate(problem, &mut attempt, recorder)?;
     }
     metric_of(problem, attempt, recorder)
 }

@@ -36,7 +36,7 @@ pub fn extend(problem: &Problem, seed: Attempt, recorder: &mut Recorder) -> Resu
     let mut model = components::first(problem, &seed, recorder);
     let mut trials = vec![growth::Trial::default(); problem.views()];
     register::join(problem, &mut model, FIRST, &mut trials, recorder)?;
-    components::others(problem, &mut model, &seed, &mut trials, recorder)?;
+    components::others(problem, &mut model, &mut trials, recorder)?;
     components::join_rest(problem, &mut model, &mut trials, recorder)?;
     recorder.end_components();
     let options = GrowthOptions::LAST;

@@ -161,11 +161,6 @@ options! {
         most_components: u32 = 100,
         /// The best come first, and an input without overlap has any number of hopeless ones.
         most_failures: usize = 3,
-        /// Deviation of the log focal length that other components are given, at least, where the first has one, and
-        /// where it has none. Components differ by more than each admits.
-        prior_sigma: f64 = 0.02,
-        /// It only keeps them from running away.
-        vague_sigma: f64 = 0.5,
     }
 }
 

@@ -68,7 +68,7 @@ pub fn by_projective_extension(
         if best.as_ref().is_some_and(|best| is_known(best) || outweighs(best, &attempt)) {
             continue;
         }
-        attempt::calibrate(problem, &mut attempt, &[], recorder)?;
+        attempt::calibrate(problem, &mut attempt, recorder)?;
         if best.as_ref().is_none_or(|best| {
             outweighs(&attempt, best) || attempt_worth(&attempt, problem) > attempt_worth(best, problem)
         }) {

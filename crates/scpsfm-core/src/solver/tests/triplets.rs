@@ -50,7 +50,7 @@ fn scattered(seed: u64, outliers: f64) -> (Input, Scene) {
     let input = Input::new(raw, &Limits::default(), "scattered").expect("valid input");
     let (settings, stop) = (SolveSettings::default(), StopToken::default());
     let problem = Problem::new(&input, &settings, Threads::ONE, &stop);
-    assert!(view_selection::blocks(&problem).is_empty(), "seed {seed}: three views share enough tracks");
+    assert!(view_selection::candidate_views(&problem).is_empty(), "seed {seed}: three views share enough tracks");
     drop(problem);
     (input, scene)
 }
