@@ -112,40 +112,46 @@ fn undo(problem: &mut Problem, recorder: &mut Recorder) -> Result<bool, Error> {
         let sets = view_selection::candidate_views_among(problem, &open);
         let subsets = view_selection::subsets(&sets);
         let sets: Vec<Vec<usize>> = subsets.into_iter().chain(sets).take(OPTIONS.sets).collect();
-        let of_pinhole = evidence(problem, &sets, recorder)?;
-        let total_of_pinhole = total(&of_pinhole);
+        let of_pinhole: Vec<f64> =
+            sets.iter().map(|views| evidence(problem, views, recorder)).collect::<Result<_, _>>()?;
+        let total_of_pinhole = of_pinhole.iter().sum::<f64>();
+        let seeds: Vec<Seed> =
+            sets.into_iter().zip(of_pinhole).map(|(views, of_pinhole)| Seed { views, of_pinhole }).collect();
         let without = problem.undone.take();
-        let mut best = Best { focal: None, evidence: of_pinhole.clone(), undone: None };
+        let mut best = Best { focal: None, evidence: total_of_pinhole, undone: None };
         for focal in OPTIONS.focals {
-            best.offer(focal, without.as_ref(), camera, problem, &sets, recorder)?;
+            best.offer(focal, without.as_ref(), camera, problem, &seeds, recorder)?;
         }
         for factor in OPTIONS.refining {
             let Some(focal) = best.focal else { break };
             for focal in [focal * factor, focal / factor] {
-                best.offer(focal, without.as_ref(), camera, problem, &sets, recorder)?;
+                best.offer(focal, without.as_ref(), camera, problem, &seeds, recorder)?;
             }
         }
         let least = total_of_pinhole + OPTIONS.least_gain.max(OPTIONS.least_share * total_of_pinhole);
-        // A seed of few tracks may find another set of them by chance and gain by it, but hardly each seed does.
-        let gains = |(own, of_pinhole): (&f64, &f64)| *own > of_pinhole - OPTIONS.least_gain;
-        let gains_everywhere = best.evidence.iter().zip(&of_pinhole).all(gains);
-        let is_taken = gains_everywhere && total(&best.evidence) > least;
-        problem.undone = best.undone.filter(|_| is_taken).or(without);
+        problem.undone = best.undone.filter(|_| best.evidence > least).or(without);
     }
     Ok(problem.undone.is_some())
+}
+
+/// Views that a camera's lenses are compared on, with the evidence of their quick seed behind a pinhole.
+struct Seed {
+    views: Vec<usize>,
+    of_pinhole: f64,
 }
 
 /// The lens of a camera that explains its seeds best.
 struct Best {
     /// `None`: a pinhole does.
     focal: Option<f64>,
-    /// Of each seed.
-    evidence: Vec<f64>,
+    /// Of all seeds.
+    evidence: f64,
     undone: Option<Undone>,
 }
 
 impl Best {
-    /// Takes an equidistant fisheye of this focal length where it is better.
+    /// Takes an equidistant fisheye of this focal length where it is better, and no worse than a pinhole for any seed: a
+    /// seed of few tracks may find another set of them by chance and gain by it, but hardly each seed does.
     ///
     /// * `without`: what is undone of other cameras
     fn offer(
@@ -154,36 +160,37 @@ impl Best {
         without: Option<&Undone>,
         camera: usize,
         problem: &mut Problem,
-        sets: &[Vec<usize>],
+        seeds: &[Seed],
         recorder: &mut Recorder,
     ) -> Result<(), Error> {
         problem.undone = Undone::new(problem, without, [(camera, Intrinsics::equidistant(focal))]);
         if problem.undone.is_none() {
             return Ok(());
         }
-        let evidence = evidence(problem, sets, recorder)?;
+        let mut total = 0.0;
+        for Seed { views, of_pinhole } in seeds {
+            let evidence = evidence(problem, views, recorder)?;
+            if evidence <= of_pinhole - OPTIONS.least_gain {
+                problem.undone = None;
+                return Ok(());
+            }
+            total += evidence;
+        }
         let undone = problem.undone.take();
-        if total(&evidence) > total(&self.evidence) {
-            *self = Self { focal: Some(focal), evidence, undone };
+        if total > self.evidence {
+            *self = Self { focal: Some(focal), evidence: total, undone };
         }
         Ok(())
     }
 }
 
-/// Evidence of a quick seed on each of these sets of views.
-fn evidence(problem: &Problem, sets: &[Vec<usize>], recorder: &mut Recorder) -> Result<Vec<f64>, Error> {
-    let of_set = |views: &Vec<usize>| {
-        problem.stopped()?;
-        let attempt = attempt::search_block(problem, problem.block(views), QUICK_SEED, recorder)?;
-        Ok(attempt.projective.as_ref().map_or(0.0, |found| {
-            f64::max(found.evidence(problem.outlier_density), by_homographies(problem, found).unwrap_or(0.0))
-        }))
-    };
-    sets.iter().map(of_set).collect()
-}
-
-fn total(evidence: &[f64]) -> f64 {
-    evidence.iter().sum()
+/// Evidence of a quick seed on these views.
+fn evidence(problem: &Problem, views: &[usize], recorder: &mut Recorder) -> Result<f64, Error> {
+    problem.stopped()?;
+    let attempt = attempt::search_block(problem, problem.block(views), QUICK_SEED, recorder)?;
+    Ok(attempt.projective.as_ref().map_or(0.0, |found| {
+        f64::max(found.evidence(problem.outlier_density), by_homographies(problem, found).unwrap_or(0.0))
+    }))
 }
 
 /// Evidence of the homographies between the views of a reconstruction: where a camera only turns or the scene is a
