@@ -10,7 +10,7 @@ mod view_focals;
 use nalgebra::{Matrix3, Matrix3x4, SMatrix, SVector, Vector3};
 
 pub use self::frame::{CanonicalFrame, oriented, to_canonical_frame};
-pub use self::starts::{linear, scan, scan_focal, scan_planes};
+pub use self::starts::{scan, scan_focal, scan_planes};
 pub use self::view_focals::{view_focal, view_focal_starts};
 use super::bundle::metric::Intrinsics;
 use super::levenberg_marquardt::{self, LeastSquares, Normal, Options};
@@ -186,7 +186,6 @@ pub fn hypothesis_residual(cameras: &[Matrix3x4<f64>]) -> f64 {
     let Some(frame) = to_canonical_frame(cameras, &[]) else { return worst };
     let mut starts = scan(&frame.cameras, HYPOTHESIS_FOCALS, HYPOTHESIS_VIEWS);
     starts.truncate(HYPOTHESIS_STARTS);
-    starts.extend(linear(&frame.cameras).map(|daq| (daq, residual(&frame.cameras, &daq))));
     starts
         .iter()
         .map(|(start, _)| refine(&frame.cameras, *start, Free::FocalAndPlane, HYPOTHESIS_ITERATIONS).1)

@@ -2,7 +2,7 @@
 
 use nalgebra::Matrix3x4;
 
-use super::starts::{linear, ranked, scan_focal, scanned};
+use super::starts::{ranked, scan_focal, scanned};
 use super::{Daq, infinite_homography};
 
 /// Focal lengths of the first view that are tried, views that the plane at infinity is taken from, and the ratios of
@@ -26,12 +26,11 @@ pub fn view_focal(camera: &Matrix3x4<f64>, daq: &Daq) -> Option<(f64, f64)> {
     usable.then(|| (squared.sqrt(), skew + centre))
 }
 
-/// Quadrics to start from, best first: the linear one, which asks for no constant focal length, and the planes at
-/// infinity that pairs of focal lengths give in closed form. `daq.intrinsics` is the first view's.
+/// Quadrics to start from, best first: the planes at infinity that pairs of focal lengths give in closed form.
+/// `daq.intrinsics` is the first view's.
 pub fn view_focal_starts(cameras: &[Matrix3x4<f64>]) -> Vec<(Daq, f64)> {
     let focals = (0..FOCALS).map(|step| scan_focal(step, FOCALS));
-    let found = linear(cameras).into_iter().chain(scanned(cameras, focals, VIEWS, &RATIOS)).collect();
-    ranked(found, |daq| {
+    ranked(scanned(cameras, focals, VIEWS, &RATIOS), |daq| {
         cameras.iter().map(|camera| view_focal(camera, daq).map_or(1.0, |(_, cost)| cost.min(1.0))).sum()
     })
 }

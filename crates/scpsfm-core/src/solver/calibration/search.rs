@@ -334,15 +334,14 @@ pub(super) fn distinct(mut found: Vec<Minimum>, problem: &Uncalibrated) -> Vec<M
     kept
 }
 
-/// Different starts: the linear DAQ and the best of the scan, refined, then the best of each window of the scan.
+/// Different starts: the best of the scan, refined, then the best of each window of the scan.
 fn starts(frame: &CanonicalFrame, options: &SearchOptions) -> Vec<Daq> {
     let cameras = &frame.cameras;
     let scanned = daq::scan(cameras, options.scan_focals, options.scan_views);
     let best_near = |focal: f64, half_width: f64| {
         scanned.iter().find(|(daq, _)| (daq.intrinsics.focal / focal).ln().abs() < half_width).map(|(daq, _)| *daq)
     };
-    let mut to_refine: Vec<Daq> = daq::linear(cameras).into_iter().collect();
-    to_refine.extend(scanned.iter().take(options.refined_from_scan).map(|(daq, _)| *daq));
+    let mut to_refine: Vec<Daq> = scanned.iter().take(options.refined_from_scan).map(|(daq, _)| *daq).collect();
     to_refine.extend(options.scan_centres.into_iter().filter_map(|focal| best_near(focal, options.scan_half_width)));
     let mut refined: Vec<(Daq, f64)> = to_refine
         .into_iter()
