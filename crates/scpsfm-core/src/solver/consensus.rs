@@ -48,11 +48,6 @@ options! {
         /// Bounds of the estimate, normalised units. A hundredth of a pixel in a 10,000 px image, and a tenth of the
         /// image.
         bounds: (f64, f64) = (1e-6, 0.1),
-        /// Higher levels, in units of the consensus's own, from which it settles too.
-        higher: [f64; 2] = [2.0, 4.0],
-        /// Settled noise, in units of that the consensus was found at, below which its gate was wide enough to lose
-        /// nothing.
-        surely_high: f64 = 0.75,
     }
 }
 

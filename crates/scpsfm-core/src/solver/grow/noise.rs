@@ -6,7 +6,7 @@ use crate::domain::StopToken;
 use crate::geometry::measurement::CompleteBlock;
 use crate::geometry::statistics::{chi_square_median, median};
 use crate::solver::a_contrario;
-use crate::solver::consensus::{Consensus, ConsensusOptions, LEAST_INLIERS, NoiseOptions, constraint_count, judge};
+use crate::solver::consensus::{Consensus, ConsensusOptions, LEAST_INLIERS, NoiseOptions, constraint_count};
 
 const OPTIONS: NoiseOptions = NoiseOptions::DEFAULT;
 
@@ -44,37 +44,14 @@ fn settle_noise(block: &CompleteBlock, consensus: Consensus, stop: &StopToken) -
     current
 }
 
-/// The best of what settles from the consensus's noise and from higher ones, with the logarithm of its false alarms.
-///
-/// A consensus found at a noise that is too low has lost its worse tracks, and an estimate from those that remain stays
-/// too low; seen from higher up they come back. Of the outcomes the one least likely to be chance stands.
+/// The consensus settled at its noise, with the logarithm of its false alarms.
 ///
 /// * `consensus`: polished at its own noise, as [`grow`](super::grow) returns it
 /// * `spread`: see [`Consensus::ln_false_alarms_by_residuals`]
 pub fn refine(block: &CompleteBlock, consensus: &Consensus, spread: f64, stop: &StopToken) -> (Consensus, f64) {
-    let higher = |factor: f64| {
-        let noise = (factor * consensus.noise).min(OPTIONS.bounds.1);
-        Fits::new(block, noise, stop).polish(judge(block, consensus.cameras.clone(), noise, stop))
-    };
-    let with_chance = |settled: Consensus| {
-        let ln_false_alarms = a_contrario::ln_false_alarms(block, &settled, spread, stop);
-        (settled, ln_false_alarms)
-    };
-    let mut best = with_chance(settle_noise(block, consensus.clone(), stop));
-    if best.0.noise < OPTIONS.surely_high * consensus.noise {
-        return best;
-    }
-    for factor in OPTIONS.higher {
-        let settled = settle_noise(block, higher(factor), stop);
-        // Most settle where the best one is: to try cameras takes longer than to settle, and they can only veto.
-        if settled.ln_false_alarms_by_residuals(spread) < best.1 {
-            let settled = with_chance(settled);
-            if settled.1 < best.1 {
-                best = settled;
-            }
-        }
-    }
-    best
+    let settled = settle_noise(block, consensus.clone(), stop);
+    let ln_false_alarms = a_contrario::ln_false_alarms(block, &settled, spread, stop);
+    (settled, ln_false_alarms)
 }
 
 /// Noise of a consensus by the median of these tracks' residuals.
