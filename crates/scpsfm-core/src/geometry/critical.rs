@@ -28,7 +28,7 @@ const MOST_MISSED: f64 = 1.0;
 /// Rounds of alternation for the depths of a translation's start; the adjustment does the rest.
 const DEPTH_ROUNDS: usize = 10;
 /// Iterations of each adjustment: they start near the minimum, or the model is wrong and its cost only has to show it.
-pub const ITERATIONS: usize = 30;
+pub const ADJUSTMENT_ITERATIONS: usize = 30;
 
 /// A model at its minimum.
 #[derive(Debug, Clone)]
@@ -40,8 +40,8 @@ pub struct CriticalFit<M> {
     pub unknowns: usize,
 }
 
-/// Homographies from a reference view, and where it sees each point, the origin for points that no view sees: what fits
-/// without parallax start from.
+/// Homographies from a reference view, and where it sees each point, the origin for points without a finite position:
+/// what fits without parallax start from.
 ///
 /// Returns `None` where common points do not tie all views together.
 pub fn reference_homographies(
@@ -71,7 +71,7 @@ pub fn reference_homographies(
 pub fn squared_residuals(start: &Homographies, observations: &[Observation], noise: f64, stop: &StopToken) -> Vec<f64> {
     let mut adjusted = start.clone();
     let loss = Loss::Cauchy { scale: CAUCHY_SCALE * noise };
-    minimise(&mut adjusted, observations, &Options { loss, ..Options::squared(ITERATIONS) }, stop);
+    minimise(&mut adjusted, observations, &Options { loss, ..Options::squared(ADJUSTMENT_ITERATIONS) }, stop);
     let squared = |seen: &Observation| {
         let moved = adjusted.views.get(seen.view)? * adjusted.points.get(seen.point)?.push(1.0);
         Some(seen.weight * (moved.xy() / moved.z - seen.xy).norm_squared())
@@ -104,7 +104,7 @@ pub fn fit_rotation(
         rotation = rotation.with_own_focals();
     }
     let simplest = IntrinsicsModel::focal(model.is_per_view());
-    let options = Options::squared(ITERATIONS);
+    let options = Options::squared(ADJUSTMENT_ITERATIONS);
     sequence::adjust_all(&mut rotation, observations, simplest, priors, &options, stop);
     let report = sequence::adjust_all(&mut rotation, observations, model, priors, &options, stop);
     let cost = report.cost - IntrinsicsPrior::cost_of(priors, model, &rotation.intrinsics);
@@ -245,7 +245,7 @@ pub fn fit_translation(
     let mut model = Translating { translations: epipoles, points: at_unit_depth.collect() };
     alternate(&mut model, observations, reference);
     let unknowns = (3 * (views + observed)).saturating_sub(TRANSLATING_GAUGE);
-    let report = minimise(&mut model, observations, &Options::squared(ITERATIONS), stop);
+    let report = minimise(&mut model, observations, &Options::squared(ADJUSTMENT_ITERATIONS), stop);
     Some(CriticalFit { model, cost: report.cost, unknowns })
 }
 
@@ -324,7 +324,7 @@ mod tests {
         let reduced =
             |cost: f64, unknowns: usize| cost / (noise * noise * (2 * scene.observations.len() - unknowns) as f64);
         let start = reference_homographies(&scene.observations, views, points, noise).expect("complete tracks");
-        let plane = fit_homographies(start, &scene.observations, ITERATIONS, &stop);
+        let plane = fit_homographies(start, &scene.observations, ADJUSTMENT_ITERATIONS, &stop);
         let turning = rotation_start(&scene.observations, views, points, noise).expect("complete tracks");
         let turning =
             fit_rotation(&turning, &scene.observations, &vec![0; views], FULL, &PRIORS, &stop).expect("turns");
@@ -375,7 +375,7 @@ mod tests {
         scene.observations.iter_mut().for_each(|seen| seen.xy = Vector2::new(0.25, 0.5));
         fit_translation(&scene.observations, 8, 40, NOISE, 5.0, &stop);
         if let Some(start) = reference_homographies(&scene.observations, 8, 40, NOISE) {
-            fit_homographies(start, &scene.observations, ITERATIONS, &stop);
+            fit_homographies(start, &scene.observations, ADJUSTMENT_ITERATIONS, &stop);
         }
         if let Some(start) = rotation_start(&scene.observations, 8, 40, NOISE) {
             fit_rotation(&start, &scene.observations, &[0; 8], FULL, &PRIORS, &stop);

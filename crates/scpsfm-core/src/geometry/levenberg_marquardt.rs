@@ -24,8 +24,8 @@ const PACE_STEPS: usize = 12;
 pub(crate) trait LeastSquares {
     type State: Clone;
 
-    /// Least damping, relative to the diagonal: below that of dense problems, rounding in the gauge directions would be
-    /// amplified into the step.
+    /// Least damping, relative to the diagonal. The default is that of dense problems: with less, rounding in the gauge
+    /// directions is amplified into the step.
     const MIN_DAMPING: f64 = 1e-10;
 
     /// The cost of a state; infinite or not a number where it has none.
@@ -96,7 +96,7 @@ pub struct Options {
     /// Ends as hopeless where the steps that are left, at the pace of the last [`PACE_STEPS`], do not bring the cost
     /// below this; infinite: never.
     pub hopeless_above: f64,
-    /// Of the residuals of a bundle adjustment; other problems have a loss of their own.
+    /// Read by bundle adjustment alone; other problems have a loss of their own.
     pub loss: Loss,
 }
 

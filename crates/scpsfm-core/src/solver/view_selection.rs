@@ -63,7 +63,7 @@ pub fn whole(problem: &Problem) -> Option<Vec<usize>> {
     complete_views(problem.input, &problem.ranges).map(|views| evenly(&views, OPTIONS.most_views_whole))
 }
 
-/// The same of incomplete tracks, only of views that are `open` (one entry a view); at most
+/// Blocks of the views that are `open` (one entry a view), whose tracks are incomplete, best first; at most
 /// [`ViewSelectionOptions::most_blocks`].
 pub fn candidate_views_among(problem: &Problem, open: &[bool]) -> Vec<Vec<usize>> {
     let found = [OPTIONS.wanted_tracks, LEAST_INLIERS].into_iter().map(|least| greedy_views(problem, open, least));

@@ -32,7 +32,7 @@ const OPTIONS: FalseAlarmOptions = FalseAlarmOptions::DEFAULT;
 /// * `spread`: see [`Consensus::ln_false_alarms_by_residuals`]
 pub fn ln_false_alarms(block: &CompleteBlock, consensus: &Consensus, spread: f64, stop: &StopToken) -> f64 {
     let distinct = consensus.distinct_count(spread);
-    let by_residuals = consensus.ln_by_residuals(spread, distinct);
+    let by_residuals = consensus.ln_false_alarms_by_residuals(spread, distinct);
     if by_residuals >= OPTIONS.ln_acceptable {
         return by_residuals;
     }
@@ -88,12 +88,9 @@ impl Consensus {
     /// Natural logarithm of the number of such consensuses to be expected in data without structure (Moisan & Stival
     /// 2004, a-contrario): all subsets of that size, times the probability that unstructured coordinates of standard
     /// deviation `spread` leave residuals this small in all constraints that the model does not absorb.
-    pub fn ln_false_alarms_by_residuals(&self, spread: f64) -> f64 {
-        self.ln_by_residuals(spread, self.distinct_count(spread))
-    }
-
-    /// The same, of so many inliers that differ.
-    fn ln_by_residuals(&self, spread: f64, inliers: usize) -> f64 {
+    ///
+    /// * `inliers`: that differ, see [`Self::distinct_count`]
+    fn ln_false_alarms_by_residuals(&self, spread: f64, inliers: usize) -> f64 {
         let (views, tracks) = (self.cameras.len(), self.inlier.len());
         let constraints = consensus::constraint_count(views, inliers);
         let Some(rms) = self.rms() else { return f64::INFINITY };
@@ -220,7 +217,8 @@ mod tests {
             let apart = (0..10).map(|k| Point::new(0.1 * f64::from(k), 0.0, 0.0, 1.0));
             let group = (0..30).map(|k| Point::new(0.5, 0.5 + distance * f64::from(k), 0.0, 1.0));
             let consensus = consensus_of(apart.chain(group).collect(), noise);
-            (consensus.distinct_count(0.3), consensus.ln_false_alarms_by_residuals(0.3))
+            let distinct = consensus.distinct_count(0.3);
+            (distinct, consensus.ln_false_alarms_by_residuals(0.3, distinct))
         };
         let (near, apart) = (count(0.1 * noise), count(20.0 * noise));
         assert_eq!((near.0, apart.0), (11, 40));

@@ -11,9 +11,12 @@ options! {
         /// that determine them. Of 200 entirely wrong inputs of 3 to 10 views none is answered, and eight right tracks
         /// among 200 in ten views are.
         ln_by_cameras: f64 = -10.0,
-        /// Noise levels that a consensus is grown and settled at, each a test of its own. Five of the search, one of the
-        /// refinement.
+        /// Noise levels that a consensus is grown and settled at, each a test of its own. Five of the search, one of
+        /// the refinement.
         noise_levels: f64 = 6.0,
+        /// Neighbours of a point that are no near-duplicates: as many as of points anywhere in the image, and so many
+        /// standard deviations of their number (Poisson's).
+        usual_sigmas: f64 = 2.0,
         /// Random tracks that cameras are tried on. Some milliseconds at 10 views, for the few consensuses that may be
         /// accepted.
         random_tracks: usize = 500,

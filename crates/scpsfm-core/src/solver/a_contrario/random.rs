@@ -80,8 +80,8 @@ pub fn measured(squared: &[f64]) -> f64 {
     squared[(OPTIONS.measured_share * squared.len() as f64) as usize]
 }
 
-/// Natural logarithm of the probability `a` of which `a^n` bounds that `n` tracks without structure are all admitted and
-/// leave no more on average than the inliers of the consensus do: see [`ln_as_small`].
+/// Natural logarithm of the probability `a` of which `a^n` bounds that `n` tracks without structure are all admitted
+/// and leave no more on average than the inliers of the consensus do: see [`ln_as_small`].
 ///
 /// * `squared`: as of [`residuals`]
 /// * `variance`: of the image points

@@ -48,8 +48,8 @@ impl Uncalibrated<'_> {
     /// with distortion once for each kind of lens. An extension that the data can neither confirm nor refute thus costs
     /// what it would move.
     ///
-    /// The value reported is that of the best model's adjustment, not the minimum that its linearisation predicts: what a
-    /// descent along a flat valley still had to go is part of its error.
+    /// The value reported is that of the best model's adjustment, which along a flat valley may end before the minimum
+    /// that its linearisation predicts. The distance to that is part of the error, like those of other models.
     ///
     /// The same models behind lenses of the other projection take part where that was tried, as probable beforehand;
     /// poses and points are taken to be known alike behind either. The terms of distortion are averaged over the models
@@ -98,7 +98,7 @@ impl Uncalibrated<'_> {
                 let found = (optimum.variance_of(group, parameter), value(from, optimum));
                 is_comparable(from).then_some((weight, found))
             };
-            // With other priors: as far from their minimum as it is from its own.
+            // With other priors the value keeps the distance that it has to the minimum with its own.
             let reported = value(best, &here) - own.shift_of(group, parameter);
             averaged(&mut weights.iter().zip(&models).filter_map(of_model), reported).filter(|_| is_free)
         };

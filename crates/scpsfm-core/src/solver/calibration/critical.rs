@@ -137,7 +137,7 @@ fn without_parallax(
         let start = critical::rotation_start(observations, views, points, fit.noise)?;
         let model = IntrinsicsModel::focal(focal_per_view).with_all_extensions();
         let rotation = critical::fit_rotation(&start, observations, group_of, model, &priors, stop)?;
-        Some((critical::fit_homographies(plane, observations, critical::ITERATIONS, stop), rotation, start))
+        Some((critical::fit_homographies(plane, observations, critical::ADJUSTMENT_ITERATIONS, stop), rotation, start))
     };
     let Some((plane, rotation, start)) = fits() else {
         if !is_flat {

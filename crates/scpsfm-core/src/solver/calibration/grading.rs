@@ -139,7 +139,6 @@ pub(super) fn select_near(
     let model = metric.model();
     let near = problem.adjusted(metric.clone(), model, fit.noise);
     Error::check(problem.stop)?;
-    (problem.heartbeat)();
     let cost = near.minimum.cost;
     if !cost.is_finite() {
         return Ok(None);
@@ -184,7 +183,6 @@ fn with_others(problem: &Uncalibrated, mut selection: Selection, minima: Vec<Min
         let best = &selection.best;
         let start = start.reconstruction.of_model(best.model);
         let found = problem.search(&best.priors).converged_near(start, best.model, best.minimum.cost);
-        (problem.heartbeat)();
         let Some(mut minimum) = found else { continue };
         let lowered = best.minimum.cost - minimum.cost;
         let is_told_apart = lowered > grades.indistinguishable * best.fit.noise.powi(2);

@@ -56,7 +56,7 @@ pub struct Uncalibrated<'a> {
     pub scale_px: f64,
     pub options: &'a CalibrationOptions,
     pub stop: &'a StopToken,
-    /// Called after each step of the calibration, of which a large problem takes some tenths of a second.
+    /// Called after each adjustment, which of a large problem takes some tenths of a second.
     pub heartbeat: &'a dyn Fn(),
 }
 

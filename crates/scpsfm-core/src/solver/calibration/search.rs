@@ -135,7 +135,6 @@ impl Search<'_> {
                 cheapest = cheapest.min(minimum.cost);
                 found.push(minimum);
             }
-            (self.problem.heartbeat)();
         }
         Error::check(self.problem.stop)?;
         Ok(distinct(found, self.problem))
@@ -176,6 +175,7 @@ impl Search<'_> {
         let Uncalibrated { observations, stop, .. } = *self.problem;
         let mut reconstruction = start;
         let report = sequence::adjust_all(&mut reconstruction, observations, model, self.priors, options, stop);
+        (self.problem.heartbeat)();
         let cheirality = cheirality(&reconstruction, observations);
         Minimum { reconstruction, cost: report.cost, cheirality, is_hopeless: report.is_hopeless }
     }
@@ -204,7 +204,6 @@ impl Search<'_> {
             let search = Search { problem: &stretch.problem, ..*self };
             let here = MetricReconstruction { intrinsics: metric.intrinsics.clone(), ..stretch.metric.clone() };
             let near = search.converged(here.clone(), model);
-            (self.problem.heartbeat)();
             let starts = factors.iter().map(|&factor| start(&search, &here, factor));
             let found = search.converged_below(near.cost, starts, model)?;
             factors = found.iter().map(|other| (other.log_focal() - near.log_focal()).exp()).collect();

@@ -106,9 +106,9 @@ pub struct SplitPoint {
     pub retained: Vec<Observation>,
 }
 
-/// The point of a track that two registered views see and that is more likely right than wrong. Two observations fit a
-/// point in three of their four coordinates, so that a wrong track agrees where it is within the noise of the epipolar
-/// line by chance: this verifies nothing.
+/// The point of a track that two registered views see and that is more likely right than wrong. This verifies nothing:
+/// two observations fit a point in three of their four coordinates, and a wrong track may be within the noise of the
+/// epipolar line by chance.
 pub struct TwoViewPoint {
     pub track: usize,
     /// Probability that it is right.
@@ -119,7 +119,7 @@ pub struct TwoViewPoint {
 }
 
 /// Judges every track that has three observations in registered views or more; the others, and static ones that the
-/// geometry is not of, have weight 0 and no residuals. Of those with two it says where their points are.
+/// geometry is not of, have weight 0 and no residuals. Tracks with two that are likely right are listed apart.
 ///
 /// Twice: with a wide tail first, then with the tail that the tracks show which are right in all their observations.
 /// Where there is none, a wrong observation is told from a right one nearer by: at 8 to 9 core deviations instead of 12

@@ -196,10 +196,10 @@ impl TrackClassifier<'_> {
         }
     }
 
-    /// The observations that a verdict begins with: all, or those that agree where links may be wrong; `None` where
-    /// none do.
+    /// The observations that a verdict begins with: all, or those that agree where links may be wrong, which of two
+    /// says nothing; `None` where none do.
     fn retained_at_first(&self, observations: &[Observation], gate: f64) -> Option<Vec<usize>> {
-        if !self.geometry.by_observation {
+        if !self.geometry.by_observation || observations.len() < VERIFIED {
             return Some((0..observations.len()).collect());
         }
         let found = self.triangulator.robust(observations, gate)?;

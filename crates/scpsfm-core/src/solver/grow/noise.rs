@@ -44,7 +44,7 @@ fn settle_noise(block: &CompleteBlock, consensus: Consensus, stop: &StopToken) -
     current
 }
 
-/// The consensus settled at its noise, with the logarithm of its false alarms.
+/// The consensus once its noise and its inliers agree, with the logarithm of its false alarms.
 ///
 /// * `consensus`: polished at its own noise, as [`grow`](super::grow) returns it
 /// * `spread`: see [`Consensus::ln_false_alarms_by_residuals`]

@@ -11,10 +11,10 @@ use crate::solver::recorder::Recorder;
 use crate::solver::view_selection;
 
 /// What came of the blocks of an input.
-pub struct Tried {
+pub struct BlocksOutcome {
     pub ended: Ended,
     /// Whether nothing else needs to be tried.
-    pub is_last: bool,
+    pub is_settled: bool,
 }
 
 /// Sets of views that a reconstruction may begin with, best first.
@@ -28,7 +28,10 @@ impl Blocks {
     pub fn of(problem: &Problem) -> Self {
         match view_selection::whole(problem) {
             Some(whole) => Self { sets: vec![whole], is_whole: true },
-            None => Self { sets: view_selection::candidate_views(problem), is_whole: false },
+            None => {
+                let sets = view_selection::candidate_views_among(problem, &vec![true; problem.views()]);
+                Self { sets, is_whole: false }
+            }
         }
     }
 
@@ -39,14 +42,19 @@ impl Blocks {
     }
 
     /// Calibrates the blocks and extends them from there.
-    pub fn by_calibration(&self, problem: &Problem, is_quick: bool, recorder: &mut Recorder) -> Result<Tried, Error> {
+    pub fn by_calibration(
+        &self,
+        problem: &Problem,
+        is_quick: bool,
+        recorder: &mut Recorder,
+    ) -> Result<BlocksOutcome, Error> {
         let ended = if self.is_whole {
             let attempt = of_whole(problem, &self.sets[0], is_quick, recorder)?;
             // A second search, which tries everything, has the last word. With depths there is one only, and subsets
             // follow.
             let is_last = !is_quick && !problem.input.has_depths() && attempt.projective.is_some();
             if is_last || attempt.is_trusted() || attempt.is_beyond_image_points() {
-                return Ok(Tried { ended: finished(problem, attempt, recorder)?, is_last: true });
+                return Ok(BlocksOutcome { ended: finished(problem, attempt, recorder)?, is_settled: true });
             }
             match attempt.is_calibrated() {
                 true => metric_of(problem, attempt, recorder)?,
@@ -55,8 +63,8 @@ impl Blocks {
         } else {
             by_calibrated_blocks(problem, &self.sets, Effort { is_seed: true, is_quick }, recorder)?
         };
-        let is_last = matches!(&ended, Ended::Extended(extended) if extended.is_settled(problem));
-        Ok(Tried { ended, is_last })
+        let is_settled = matches!(&ended, Ended::Extended(extended) if extended.is_settled(problem));
+        Ok(BlocksOutcome { ended, is_settled })
     }
 }
 

@@ -123,9 +123,14 @@ pub fn join_rest(
     Ok(())
 }
 
-/// The best block of open views.
+/// The best block of open views: of one camera, which determines it better, or where there is none, of several.
 fn next_block(problem: &Problem, open: &[bool]) -> Option<SeedViews> {
-    view_selection::candidate_views_among(problem, open).into_iter().next().map(SeedViews::Block)
+    let among = |open: &[bool]| view_selection::candidate_views_among(problem, open).into_iter().next();
+    let of_camera = |camera: usize| {
+        let is_open = |(open, of): (&bool, &usize)| *open && *of == camera;
+        among(&open.iter().zip(&problem.camera_of).map(is_open).collect::<Vec<bool>>())
+    };
+    (0..problem.cameras).find_map(of_camera).or_else(|| among(open)).map(SeedViews::Block)
 }
 
 /// The best triplet of open views.

@@ -115,8 +115,8 @@ fn undo(problem: &mut Problem, recorder: &mut Recorder) -> Result<bool, Error> {
         let of_pinhole: Vec<f64> =
             sets.iter().map(|views| evidence(problem, views, recorder)).collect::<Result<_, _>>()?;
         let total_of_pinhole = of_pinhole.iter().sum::<f64>();
-        let seeds: Vec<Seed> =
-            sets.into_iter().zip(of_pinhole).map(|(views, of_pinhole)| Seed { views, of_pinhole }).collect();
+        let seeds: Vec<ComparedViews> =
+            sets.into_iter().zip(of_pinhole).map(|(views, of_pinhole)| ComparedViews { views, of_pinhole }).collect();
         let without = problem.undone.take();
         let mut best = Best { focal: None, evidence: total_of_pinhole, undone: None };
         for focal in OPTIONS.focals {
@@ -135,7 +135,7 @@ fn undo(problem: &mut Problem, recorder: &mut Recorder) -> Result<bool, Error> {
 }
 
 /// Views that a camera's lenses are compared on, with the evidence of their quick seed behind a pinhole.
-struct Seed {
+struct ComparedViews {
     views: Vec<usize>,
     of_pinhole: f64,
 }
@@ -150,8 +150,8 @@ struct Best {
 }
 
 impl Best {
-    /// Takes an equidistant fisheye of this focal length where it is better, and no worse than a pinhole for any seed: a
-    /// seed of few tracks may find another set of them by chance and gain by it, but hardly each seed does.
+    /// Takes an equidistant fisheye of this focal length where it is better, and no worse than a pinhole for any seed.
+    /// A seed of few tracks may find another set of them by chance and gain by it, but hardly each seed does.
     ///
     /// * `without`: what is undone of other cameras
     fn offer(
@@ -160,7 +160,7 @@ impl Best {
         without: Option<&Undone>,
         camera: usize,
         problem: &mut Problem,
-        seeds: &[Seed],
+        seeds: &[ComparedViews],
         recorder: &mut Recorder,
     ) -> Result<(), Error> {
         problem.undone = Undone::new(problem, without, [(camera, Intrinsics::equidistant(focal))]);
@@ -168,7 +168,7 @@ impl Best {
             return Ok(());
         }
         let mut total = 0.0;
-        for Seed { views, of_pinhole } in seeds {
+        for ComparedViews { views, of_pinhole } in seeds {
             let evidence = evidence(problem, views, recorder)?;
             if evidence <= of_pinhole - OPTIONS.least_gain {
                 problem.undone = None;

@@ -1,6 +1,6 @@
 //! In which order seeds are tried: what is cheap first.
 
-use super::blocks::{Blocks, Tried};
+use super::blocks::{Blocks, BlocksOutcome};
 use super::ended::{Ended, attempt_worth, metric_of};
 use super::options::ExtensionOptions;
 use super::starts::{QUICK_SEED, Start, by_projective_extension, extend_projectively, stands, starts};
@@ -19,14 +19,15 @@ pub struct QuickPass {
     blocks: Blocks,
     pub ended: Ended,
     /// Whether nothing else needs to be tried.
-    is_last: bool,
+    is_settled: bool,
 }
 
 impl QuickPass {
     pub fn new(problem: &Problem, recorder: &mut Recorder) -> Result<Self, Error> {
         let blocks = Blocks::of(problem);
-        let Tried { ended, is_last } = blocks.by_calibration(problem, blocks.begin_quickly(problem), recorder)?;
-        Ok(Self { blocks, ended, is_last })
+        let BlocksOutcome { ended, is_settled } =
+            blocks.by_calibration(problem, blocks.begin_quickly(problem), recorder)?;
+        Ok(Self { blocks, ended, is_settled })
     }
 
     /// What else is tried where the quick pass has neither a calibration nor a precise reconstruction of most views. A
@@ -37,8 +38,8 @@ impl QuickPass {
     /// stands: the blocks again, with everything that a search can try, and the subsets that are left. An input whose
     /// tracks are mostly complete is its only block; with depths it is searched at length at once.
     pub fn finish(self, problem: &Problem, recorder: &mut Recorder) -> Result<Ended, Error> {
-        let Self { blocks, ended, is_last } = self;
-        if is_last {
+        let Self { blocks, ended, is_settled } = self;
+        if is_settled {
             return Ok(ended);
         }
         let is_quick = blocks.begin_quickly(problem);
@@ -61,8 +62,8 @@ impl QuickPass {
             best = by_projective_extension(problem, best, starts, recorder)?;
         }
         if is_quick && part.is_none() && !stands(&best) {
-            let Tried { ended, is_last } = blocks.by_calibration(problem, false, recorder)?;
-            if is_last || ended.calibrated_extension(problem).is_some() {
+            let BlocksOutcome { ended, is_settled } = blocks.by_calibration(problem, false, recorder)?;
+            if is_settled || ended.calibrated_extension(problem).is_some() {
                 return Ok(ended);
             }
             best = by_projective_extension(problem, None, starts(ended.seed(), false, rest), recorder)?;

@@ -41,7 +41,7 @@ fn by_geometry(input: &Input) -> Solution {
 }
 
 #[test]
-fn a_crowd_about_a_wrong_track_outvotes_no_right_ones() {
+fn near_duplicates_of_a_wrong_track_outvote_no_right_ones() {
     for (seed, jitter_px) in [(0, 0.1), (1, 0.3), (2, 1.0), (3, 3.0)] {
         let options = SceneOptions { tracks: 105, outliers: 30.0 / 105.0, seed, ..SceneOptions::default() };
         let (input, truth) = with_groups(options, &[WrongGroup { tracks: 100, jitter_px }]);
@@ -53,14 +53,20 @@ fn a_crowd_about_a_wrong_track_outvotes_no_right_ones() {
 
 #[test]
 fn groups_verify_no_more_than_a_track_each() {
-    for seed in 0..3 {
-        let options = SceneOptions { tracks: 40, outliers: 1.0, seed, ..SceneOptions::default() };
-        let groups = [WrongGroup { tracks: 60, jitter_px: 0.3 }, WrongGroup { tracks: 40, jitter_px: 1.0 }];
-        let (input, _) = with_groups(options, &groups);
-        let solution = by_geometry(&input);
-        assert_eq!(solution.status, Status::NoReconstruction, "seed {seed}: {} inliers", solution.inlier_track_count());
-        let told = |code: WarningCode| solution.warnings.iter().any(|warning| warning.code == code);
-        assert!(told(WarningCode::FewInliers) || told(WarningCode::NoConsensus), "{:?}", solution.warnings);
+    let many = vec![WrongGroup { tracks: 60, jitter_px: 0.3 }, WrongGroup { tracks: 40, jitter_px: 1.0 }];
+    // Fewer than are represented by one, and so many that too few would remain beside the one.
+    let small = (0..6).map(|_| WrongGroup { tracks: 6, jitter_px: 0.3 }).collect();
+    let alone = vec![WrongGroup { tracks: 60, jitter_px: 0.3 }];
+    for (name, tracks, groups) in [("many", 40, many), ("small", 40, small), ("alone", 10, alone)] {
+        for seed in 0..3 {
+            let options = SceneOptions { tracks, outliers: 1.0, seed, ..SceneOptions::default() };
+            let (input, _) = with_groups(options, &groups);
+            let solution = by_geometry(&input);
+            let inliers = solution.inlier_track_count();
+            assert_eq!(solution.status, Status::NoReconstruction, "{name}, seed {seed}: {inliers} inliers");
+            let told = |code: WarningCode| solution.warnings.iter().any(|warning| warning.code == code);
+            assert!(told(WarningCode::FewInliers) || told(WarningCode::NoConsensus), "{:?}", solution.warnings);
+        }
     }
 }
 

@@ -27,9 +27,9 @@ const ITERATE_WITHIN: f64 = 2.0;
 /// The cost contains what the priors of groups with free intrinsics add, and never rises. What is held stays as it is,
 /// to the bit; what is found does not depend on the threads. One iteration costs time linear in the observations times
 /// the length of their tracks, and what the factorisation takes: linear in the views where each is connected with a
-/// bounded number of others. `run.stop` is asked every few milliseconds, but not while the observations are sorted nor
-/// within a factorisation; a stopped, stuck or degenerate problem keeps its last good state. The costs of one that was
-/// stopped before they were known are infinite.
+/// bounded number of others. `run.stop` is asked every few milliseconds, but not while the observations are laid out (a
+/// million take a fifth of a second) nor within a factorisation; a stopped, stuck or degenerate problem keeps its last
+/// good state. The costs of one that was stopped before they were known are infinite.
 ///
 /// # Pitfall
 /// Points may pass behind a camera on the way: residuals know no cheirality, so check it on the result.

@@ -12,8 +12,9 @@ const WORTH_A_THREAD: usize = 4_096;
 /// Observations of a batch: bounds the rows of the Jacobian that are held at once, 270 bytes each, to some 4 MB, and
 /// the time between two looks at the stop token to some milliseconds, 20 in builds for tests.
 pub(super) const BATCH: usize = 16_384;
-/// Points between two looks at the stop token where points are worked on one by one.
-const POINTS_BETWEEN_QUESTIONS: usize = 128;
+/// Points between two looks at the stop token where points are worked on one by one: tracks may be thousands of views
+/// long.
+const POINTS_BETWEEN_QUESTIONS: usize = 16;
 
 /// The threads of an adjustment, and the cuts of its points.
 pub(super) struct WorkerPool<'a> {

@@ -165,8 +165,8 @@ fn the_lens_that_a_reconstruction_comes_with_does_not_matter() {
 }
 
 /// A lens with a needless radial term keeps it where cameras turn by a twentieth of a degree, and loses it where they
-/// turn by one. Steps are two of what is compared with, one of the minimum, and one of each other focal length; a
-/// camera that turns no more than noise is refused after the first two.
+/// turn by one. Steps are two of what is compared with, and the adjustments: one or some of the minimum, two for each
+/// of four other focal lengths, and those of other models.
 #[test]
 fn nothing_else_is_tried_where_the_lens_leaves_the_focal_length_open() {
     let (mut open, mut determined) = (0, 0);
@@ -183,13 +183,13 @@ fn nothing_else_is_tried_where_the_lens_leaves_the_focal_length_open() {
         let steps = steps.get();
         let of = format!("turning by {max_rotation_rad}, seed {seed}");
         println!("{of}: {grade:?} {sigma_log_focal:?} after {steps} steps, {}", model.name());
-        if steps == 3 {
+        if (3..10).contains(&steps) {
             open += 1;
             assert_eq!((grade, model), (Grade::ProjectiveOnly, metric.model()), "{of}");
         }
         if grade != Grade::ProjectiveOnly {
             determined += 1;
-            assert_eq!((steps, model), (7, IntrinsicsModel::FOCAL), "{of}");
+            assert!(steps > 10 && model == IntrinsicsModel::FOCAL, "{of}");
         }
     }
     assert!(open > 0 && determined > 0, "{open} open, {determined} determined");

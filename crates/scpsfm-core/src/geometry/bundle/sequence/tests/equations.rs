@@ -204,16 +204,14 @@ fn what_is_known_beforehand_takes_part() {
     assert!((informed - information - 0.01).abs() < 1e-9 && (pulled - gradient - 0.01 * deviation).abs() < 1e-9);
 }
 
-/// A stop is seen within the work that may pass between two questions, in the middle of a linearisation.
 #[test]
-fn a_stop_is_seen_within_one_linearisation() {
+fn what_is_stopped_before_it_begins_changes_nothing() {
     let (sequence, observations) = chain(2, 10, 1 + BATCH / 20, 5, 0.001);
     let free = Free::all(&[IntrinsicsModel::FOCAL]);
     let (layout, pattern) = laid_out(&sequence, &observations, &free);
     let mut normal = Normal::new(&layout, &pattern, &sequence);
     let stop = StopToken::default();
     stop.stop(StopReason::Cancelled);
-    assert!(observations.len() > BATCH);
     for threads in [1, 3] {
         let pool = WorkerPool::new(&layout, Threads::new(threads), &stop);
         assert!(!normal.fill(&sequence, &[], Loss::Squared, &pool), "{threads} threads");
