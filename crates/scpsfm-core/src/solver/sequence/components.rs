@@ -38,7 +38,7 @@ pub fn first(problem: &Problem, seed: &Attempt, recorder: &mut Recorder) -> Mode
 }
 
 /// Solves and extends what may be a component, one after the other, as long as there is any among the views that are
-/// left: blocks, then triplets.
+/// left: blocks of one camera, then of several together, then triplets.
 pub fn others(
     problem: &Problem,
     model: &mut Model,
@@ -47,7 +47,7 @@ pub fn others(
 ) -> Result<(), Error> {
     let mut component = FIRST;
     let mut pairs = Pairs::new(problem);
-    for next_seed in [next_block, next_triplet] {
+    for next_seed in [block_of_one_camera, block_of_several, triplet] {
         let mut open: Vec<bool> = model.poses.iter().map(Option::is_none).collect();
         let mut failures = 0;
         while component + 1 < OPTIONS.most_components && failures < OPTIONS.most_failures {
@@ -123,18 +123,26 @@ pub fn join_rest(
     Ok(())
 }
 
-/// The best block of open views: of one camera, which determines it better, or where there is none, of several.
-fn next_block(problem: &Problem, open: &[bool]) -> Option<SeedViews> {
-    let among = |open: &[bool]| view_selection::candidate_views_among(problem, open).into_iter().next();
-    let of_camera = |camera: usize| {
+/// The best block of open views.
+fn block(problem: &Problem, open: &[bool]) -> Option<SeedViews> {
+    view_selection::candidate_views_among(problem, open).into_iter().next().map(SeedViews::Block)
+}
+
+/// The best block of open views of one camera, which determines it better than several together are.
+fn block_of_one_camera(problem: &Problem, open: &[bool]) -> Option<SeedViews> {
+    (0..problem.cameras).find_map(|camera| {
         let is_open = |(open, of): (&bool, &usize)| *open && *of == camera;
-        among(&open.iter().zip(&problem.camera_of).map(is_open).collect::<Vec<bool>>())
-    };
-    (0..problem.cameras).find_map(of_camera).or_else(|| among(open)).map(SeedViews::Block)
+        block(problem, &open.iter().zip(&problem.camera_of).map(is_open).collect::<Vec<bool>>())
+    })
+}
+
+/// The best block of open views of several cameras; of one there is none.
+fn block_of_several(problem: &Problem, open: &[bool]) -> Option<SeedViews> {
+    (problem.cameras > 1).then(|| block(problem, open)).flatten()
 }
 
 /// The best triplet of open views.
-fn next_triplet(problem: &Problem, open: &[bool]) -> Option<SeedViews> {
+fn triplet(problem: &Problem, open: &[bool]) -> Option<SeedViews> {
     view_selection::triplets(problem, open).into_iter().next().map(SeedViews::Triplet)
 }
 
