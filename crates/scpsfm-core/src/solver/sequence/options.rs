@@ -128,6 +128,9 @@ options! {
         /// calibrated too. One that holds the same tracks differs by a few observations; a fiftieth more are others.
         /// Calibrating each took 140 s instead of 26 where it took longest, for the same grade.
         least_evidence_growth: f64 = 1.02,
+        /// Starts that lead to it again before no others are tried. Of 600 photographed scenes none has another answer
+        /// so, and one takes a third of the time.
+        enough_repeated: usize = 2,
         /// A reconstruction without a calibration replaces a calibrated one above this ratio of their evidence. A
         /// calibration of most views stands so; one of 12 of 35 views, with recall .13, stood before poses of 25 with
         /// recall .999.

@@ -35,7 +35,7 @@ pub fn starts(found: Option<Attempt>, keeps: bool, sets: &[Vec<usize>]) -> Vec<S
 }
 
 /// The best of one that stands and of these, each extended to all views without a calibration and, where it is not
-/// known yet, calibrated then; the first that is METRIC.
+/// known yet, calibrated then; the first that is METRIC. Ends where several of them lead to the same one.
 pub fn by_projective_extension(
     problem: &Problem,
     best: Option<Attempt>,
@@ -44,7 +44,8 @@ pub fn by_projective_extension(
 ) -> Result<Option<Attempt>, Error> {
     let (mut best, mut unsolved) = if stands(&best) { (best, None) } else { (None, best) };
     let mut pairs = Pairs::new(problem);
-    let count = starts.len();
+    let options = ExtensionOptions::DEFAULT;
+    let (count, mut repeated) = (starts.len(), 0);
     for (k, start) in starts.into_iter().enumerate() {
         problem.stopped()?;
         let (mut attempt, keeps) = match start {
@@ -60,19 +61,23 @@ pub fn by_projective_extension(
             continue;
         }
         // The same one, reached from elsewhere, or a part of it: calibrating takes longer than all else.
-        let is_known = |best: &Attempt| {
-            let is_part = attempt.views().iter().all(|view| best.views().binary_search(view).is_ok());
-            let grown = attempt.evidence(problem) / best.evidence(problem);
-            is_part && grown < ExtensionOptions::DEFAULT.least_evidence_growth
-        };
-        if best.as_ref().is_some_and(|best| is_known(best) || outweighs(best, &attempt)) {
+        let grown = best.as_ref().map_or(f64::INFINITY, |best| attempt.evidence(problem) / best.evidence(problem));
+        let is_part = |best: &Attempt| attempt.views().iter().all(|view| best.views().binary_search(view).is_ok());
+        if grown < options.least_evidence_growth && best.as_ref().is_some_and(is_part) {
+            repeated += usize::from(grown * options.least_evidence_growth > 1.0);
+            if repeated == options.enough_repeated {
+                break;
+            }
+            continue;
+        }
+        if best.as_ref().is_some_and(|best| outweighs(best, &attempt)) {
             continue;
         }
         attempt::calibrate(problem, &mut attempt, recorder)?;
         if best.as_ref().is_none_or(|best| {
             outweighs(&attempt, best) || attempt_worth(&attempt, problem) > attempt_worth(best, problem)
         }) {
-            best = Some(attempt);
+            (best, repeated) = (Some(attempt), 0);
         }
         if best.as_ref().is_some_and(Attempt::is_good) {
             break;
