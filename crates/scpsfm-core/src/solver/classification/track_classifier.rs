@@ -414,6 +414,19 @@ mod tests {
         assert!(!behind.inlier, "{behind:?}");
     }
 
+    /// No point in front of both cameras agrees with them, and the one at infinity does.
+    #[test]
+    fn two_observations_of_what_is_beyond_infinity_are_of_a_point_there() {
+        let cameras = cameras(2);
+        let metric = Box::leak(Box::new(Geometry { is_metric: true, ..geometry(true) }));
+        let classifier = TrackClassifier { geometry: metric, ..classifier(&cameras, true) };
+        let beyond = Point::new(0.1, 0.2, 1.0, -0.0002);
+        let image = |camera: &Camera| (camera * beyond).xy() / (camera * beyond).z;
+        let seen = cameras.iter().enumerate().map(|(view, camera)| Observation::new(view, 0, image(camera)));
+        let verdict = judged(&classifier, &seen.collect::<Vec<_>>());
+        assert!(verdict.weight > 0.5 && !verdict.inlier && verdict.point.w == 0.0, "{verdict:?}");
+    }
+
     /// No point is in front of cameras that look away from each other, wherever it is.
     #[test]
     fn what_no_camera_has_in_front_weighs_nothing() {
