@@ -222,14 +222,20 @@ pub fn solve_densest(problem: &Problem, recorder: &mut Recorder) -> Result<Optio
         problem.stopped()?;
         recorder.begin_block(k, candidates.len());
         let attempt = solve_block(problem, problem.block(views), Effort::default(), recorder)?;
-        if best.as_ref().is_none_or(|best| attempt.merit() > best.merit()) {
-            best = Some(attempt);
-        }
+        best = better(best, attempt);
         if best.as_ref().is_some_and(Attempt::is_good) {
             break;
         }
     }
     Ok(best)
+}
+
+/// The one of the two that has more merit, the first of equals.
+pub fn better(best: Option<Attempt>, attempt: Attempt) -> Option<Attempt> {
+    match best {
+        Some(best) if best.merit() >= attempt.merit() => Some(best),
+        _ => Some(attempt),
+    }
 }
 
 /// Searches a block, or as many of its tracks as its method can afford, for a consensus.

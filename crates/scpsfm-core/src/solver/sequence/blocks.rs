@@ -3,7 +3,7 @@
 use super::ended::{Ended, finished, metric_of};
 use super::extended::{Extended, extend};
 use super::starts::extend_projectively;
-use crate::solver::attempt::{self, Attempt};
+use crate::solver::attempt::{self, Attempt, better};
 use crate::solver::error::Error;
 use crate::solver::portfolio::Effort;
 use crate::solver::problem::Problem;
@@ -116,13 +116,5 @@ fn by_calibrated_blocks(
     match unextended {
         Some(seed) => metric_of(problem, seed, recorder),
         None => Ok(Ended::Block(None)),
-    }
-}
-
-/// The one of the two that has more merit, the first of equals.
-fn better(best: Option<Attempt>, attempt: Attempt) -> Option<Attempt> {
-    match best {
-        Some(best) if best.merit() >= attempt.merit() => Some(best),
-        _ => Some(attempt),
     }
 }

@@ -70,7 +70,7 @@ pub fn grow(
 }
 
 /// The view to try next, the one that sees most points, with these observations; one that failed is tried again once it
-/// sees more. Takes time linear in the observations of all open views: of 500 views with a million, 1 to 3 % of a solve.
+/// sees more. Takes time linear in the observations of all open views.
 fn next(growth: &impl Growth, options: &GrowthOptions, trials: &[Trial]) -> Option<(usize, Vec<usize>)> {
     let is_worth = |(view, seen): &(usize, Vec<usize>)| {
         let trial = &trials[*view];
