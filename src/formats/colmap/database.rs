@@ -7,8 +7,8 @@ pub(super) mod rows;
 
 use std::path::{Path, PathBuf};
 
-use sqlx::sqlite::{SqliteConnectOptions, SqliteConnection};
-use sqlx::{ConnectOptions, Connection};
+use rusqlite::config::DbConfig;
+use rusqlite::{Connection, OpenFlags};
 
 use self::rows::Keypoints;
 pub(super) use self::rows::MAX_MATCHES;
@@ -32,7 +32,7 @@ pub fn read(path: &Path, limits: &Limits, matches: Option<Matches>) -> Result<La
     let file = display_path(path);
     let one = |problem: Problem| Error::one(&file, problem);
     refuse_unfinished(path).map_err(|what| Error::whole(&file, what))?;
-    let contents = run_apart(async || contents(path, limits, matches).await).map_err(one)?;
+    let contents = open(path).and_then(|connection| read_tables(&connection, limits, matches)).map_err(one)?;
     let labelled = contents.into_labelled(path, limits).map_err(one)?;
     labelled.check(limits)?;
     Ok(labelled)
@@ -120,55 +120,39 @@ pub(super) fn refuse_unfinished(path: &Path) -> Result<(), String> {
     Ok(())
 }
 
-/// Runs the queries on a thread and a runtime of their own: this module is synchronous, its callers may be on a
-/// runtime, which must not be blocked on from within.
-pub(super) fn run_apart<T: Send>(work: impl AsyncFnOnce() -> Result<T, Problem> + Send) -> Result<T, Problem> {
-    let work = || {
-        let runtime = tokio::runtime::Builder::new_current_thread()
-            .enable_time()
-            .build()
-            .map_err(|error| Problem::unreadable(format_args!("no runtime: {error}")))?;
-        runtime.block_on(work())
-    };
-    std::thread::scope(|scope| scope.spawn(work).join())
-        .unwrap_or_else(|_| Err(Problem::of_file("cannot be used: its queries failed within this program")))
+/// Opens a database to read. Nobody else writes meanwhile, so that no lock and no shared memory file beside it is
+/// needed.
+fn open(path: &Path) -> Result<Connection, Problem> {
+    let failed = |cause: &dyn std::fmt::Display| Problem::of_file(format!("cannot be opened: {cause}"));
+    // SQLite's own words for a file that is not there name the address.
+    std::fs::File::open(path).map_err(|error| failed(&error))?;
+    let absolute = std::path::absolute(path).map_err(|error| failed(&error))?;
+    let mut address = url::Url::from_file_path(absolute).map_err(|()| failed(&"its path is none of a file"))?;
+    address.set_query(Some("immutable=1"));
+    let flags = OpenFlags::SQLITE_OPEN_READ_ONLY | OpenFlags::SQLITE_OPEN_URI | OpenFlags::SQLITE_OPEN_NO_MUTEX;
+    let connection = Connection::open_with_flags(address.as_str(), flags).map_err(|error| failed(&error))?;
+    distrust(&connection).map_err(|error| failed(&error))?;
+    Ok(connection)
 }
 
-async fn contents(path: &Path, limits: &Limits, matches: Option<Matches>) -> Result<Contents, Problem> {
-    let options = SqliteConnectOptions::new()
-        .filename(path)
-        .read_only(true)
-        // Nobody else writes while this reads, so no lock and no shared memory file beside it is needed.
-        .immutable(true)
-        // A schema is a program too; this one is a stranger's.
-        .pragma("trusted_schema", "0")
-        .disable_statement_logging();
-    let mut connection =
-        options.connect().await.map_err(|error| Problem::of_file(format!("cannot be opened: {error}")))?;
-    // After an error the connection is dropped as it is: its thread may be gone, and to wait for it without end.
-    let found = read_tables(&mut connection, limits, matches).await?;
-    // Read-only: nothing is lost with a close that fails.
-    let _ = connection.close().await;
-    Ok(found)
+/// A schema is a program too; these are strangers'.
+pub(super) fn distrust(connection: &Connection) -> rusqlite::Result<()> {
+    connection.set_db_config(DbConfig::SQLITE_DBCONFIG_TRUSTED_SCHEMA, false).map(drop)
 }
 
-async fn read_tables(
-    connection: &mut SqliteConnection,
-    limits: &Limits,
-    matches: Option<Matches>,
-) -> Result<Contents, Problem> {
-    let tables = rows::tables(connection).await?;
+fn read_tables(connection: &Connection, limits: &Limits, matches: Option<Matches>) -> Result<Contents, Problem> {
+    let tables = rows::tables(connection)?;
     let require = |table: &str| match tables.contains(table) {
         true => Ok(()),
         false => Err(Problem::of_file(format!("is no COLMAP database: it has no table `{table}`"))),
     };
     ["cameras", "images", "keypoints"].into_iter().try_for_each(require)?;
     let (mut images, mut notes) = (Images::default(), Vec::new());
-    rows::cameras(connection, &mut images).await?;
-    rows::images(connection, limits.max_views, &mut images).await?;
-    let keypoints = rows::keypoints(connection, &images).await?;
+    rows::cameras(connection, &mut images)?;
+    rows::images(connection, limits.max_views, &mut images)?;
+    let keypoints = rows::keypoints(connection, &images)?;
     if ["frames", "frame_data"].iter().all(|table| tables.contains(*table)) {
-        match rows::frames(connection, &images).await? {
+        match rows::frames(connection, &images)? {
             Some(frames) => images.set_frames(frames),
             None => notes.push(SHARED_FRAMES.into()),
         }
@@ -180,7 +164,7 @@ async fn read_tables(
     };
     for &kind in kinds {
         require(rows::table(kind))?;
-        let matches = rows::matches(connection, kind, &images, &keypoints).await?;
+        let matches = rows::matches(connection, kind, &images, &keypoints)?;
         if !matches.is_empty() {
             return Ok(Contents { images, keypoints, matches, kind, notes });
         }

@@ -3,8 +3,7 @@
 use std::collections::BTreeMap;
 use std::path::Path;
 
-use sqlx::SqlitePool;
-use sqlx::sqlite::{SqliteConnectOptions, SqliteJournalMode, SqlitePoolOptions};
+use rusqlite::{Connection, ToSql, params};
 
 use super::ColmapImage;
 use super::database::rows::MAX_IMAGES;
@@ -52,41 +51,29 @@ pub(crate) fn dress(input: &mut LabelledInput) {
 pub(crate) fn write(path: &Path, input: &LabelledInput, more: &'static str) {
     let blob =
         |values: &[[f32; 2]]| -> Vec<u8> { values.as_flattened().iter().flat_map(|v| v.to_le_bytes()).collect() };
-    on(path, async |pool| {
-        sqlx::raw_sql(SCHEMA).execute(pool).await.expect("the schema");
-        let size = input.raw.views[0].size.expect("a size");
-        let parameters: Vec<u8> = [700.0f64, 320.0, 240.0, 0.0].iter().flat_map(|value| value.to_le_bytes()).collect();
-        let camera = sqlx::query("INSERT INTO cameras VALUES (4, 2, ?, ?, ?, 0)");
-        let camera = camera.bind(i64::from(size.width_px)).bind(i64::from(size.height_px)).bind(parameters);
-        camera.execute(pool).await.expect("a camera");
-        let rig = sqlx::query("INSERT INTO rigs VALUES (?, 4, 0)").bind(i64::from(4 + FRAME_OFFSET));
-        rig.execute(pool).await.expect("a rig");
-        for (image, label) in input.colmap_images.iter().zip(&input.view_labels) {
-            let (id, frame) = (i64::from(image.id), i64::from(image.id + FRAME_OFFSET));
-            for query in [
-                sqlx::query("INSERT INTO images VALUES (?, ?, 4)").bind(id).bind(label.to_string()),
-                sqlx::query("INSERT INTO frames VALUES (?, ?)").bind(frame).bind(i64::from(4 + FRAME_OFFSET)),
-                sqlx::query("INSERT INTO frame_data VALUES (?, ?, 4, 0)").bind(frame).bind(id),
-                sqlx::query("INSERT INTO keypoints VALUES (?, ?, 2, ?)")
-                    .bind(id)
-                    .bind(image.keypoints.len() as i64)
-                    .bind(blob(&image.keypoints)),
-            ] {
-                query.execute(pool).await.expect("a row");
-            }
-        }
-        for ([first, second], matches) in matches(input) {
-            let data: Vec<u8> = matches.as_flattened().iter().flat_map(|index| index.to_le_bytes()).collect();
-            sqlx::query("INSERT INTO matches VALUES (?, ?, 2, ?)")
-                .bind(i64::from(first) * MAX_IMAGES as i64 + i64::from(second))
-                .bind(matches.len() as i64)
-                .bind(data)
-                .execute(pool)
-                .await
-                .expect("matches");
-        }
-        sqlx::raw_sql(more).execute(pool).await.expect("valid statements");
-    });
+    let connection = Connection::open(path).expect("a database");
+    connection.execute_batch(SCHEMA).expect("the schema");
+    let run = |query: &str, values: &[&dyn ToSql]| {
+        connection.execute(query, values).expect("a row");
+    };
+    let size = input.raw.views[0].size.expect("a size");
+    let parameters: Vec<u8> = [700.0f64, 320.0, 240.0, 0.0].iter().flat_map(|value| value.to_le_bytes()).collect();
+    run("INSERT INTO cameras VALUES (4, 2, ?, ?, ?, 0)", params![size.width_px, size.height_px, parameters]);
+    run("INSERT INTO rigs VALUES (?, 4, 0)", params![4 + FRAME_OFFSET]);
+    for (image, label) in input.colmap_images.iter().zip(&input.view_labels) {
+        let (id, frame) = (image.id, image.id + FRAME_OFFSET);
+        run("INSERT INTO images VALUES (?, ?, 4)", params![id, label.to_string()]);
+        run("INSERT INTO frames VALUES (?, ?)", params![frame, 4 + FRAME_OFFSET]);
+        run("INSERT INTO frame_data VALUES (?, ?, 4, 0)", params![frame, id]);
+        let keypoints = &image.keypoints;
+        run("INSERT INTO keypoints VALUES (?, ?, 2, ?)", params![id, keypoints.len() as i64, blob(keypoints)]);
+    }
+    for ([first, second], matches) in matches(input) {
+        let data: Vec<u8> = matches.as_flattened().iter().flat_map(|index| index.to_le_bytes()).collect();
+        let pair_id = i64::from(first) * MAX_IMAGES as i64 + i64::from(second);
+        run("INSERT INTO matches VALUES (?, ?, 2, ?)", params![pair_id, matches.len() as i64, data]);
+    }
+    connection.execute_batch(more).expect("valid statements");
 }
 
 /// By ids of the images, ascending.
@@ -104,17 +91,4 @@ fn matches(input: &LabelledInput) -> BTreeMap<[u32; 2], Vec<[u32; 2]>> {
         }
     }
     matches
-}
-
-/// Works on a database, which is created, and closes it.
-pub(crate) fn on<T>(path: &Path, work: impl AsyncFnOnce(&SqlitePool) -> T) -> T {
-    let options =
-        SqliteConnectOptions::new().filename(path).create_if_missing(true).journal_mode(SqliteJournalMode::Delete);
-    let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build().expect("a runtime");
-    runtime.block_on(async {
-        let pool = SqlitePoolOptions::new().max_connections(1).connect_with(options).await.expect("a database");
-        let done = work(&pool).await;
-        pool.close().await;
-        done
-    })
 }

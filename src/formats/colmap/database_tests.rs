@@ -1,7 +1,6 @@
 use std::fs;
 
-use sqlx::SqlitePool;
-use sqlx::sqlite::{SqliteJournalMode, SqlitePoolOptions};
+use rusqlite::params;
 use tempfile::TempDir;
 
 use super::*;
@@ -27,56 +26,35 @@ fn database(more: &[&'static str]) -> (TempDir, PathBuf) {
     let path = directory.path().join("database.db");
     let floats = |values: &[f32]| values.iter().flat_map(|value| value.to_le_bytes()).collect::<Vec<u8>>();
     let doubles = |values: &[f64]| values.iter().flat_map(|value| value.to_le_bytes()).collect::<Vec<u8>>();
-    run(async {
-        let pool = open(&path).await;
-        sqlx::raw_sql(SCHEMA).execute(&pool).await.expect("the schema");
-        for (id, prior) in [(1, 1), (2, 0)] {
-            sqlx::query("INSERT INTO cameras VALUES (?, 2, 640, 480, ?, ?)")
-                .bind(id)
-                .bind(doubles(&[700.0, 320.0, 240.0, 0.0]))
-                .bind(prior)
-                .execute(&pool)
-                .await
-                .expect("a camera");
-        }
-        for (id, name, camera, columns) in [(1, "c.jpg", 1, 2), (2, "b.jpg", 2, 4), (5, "a.jpg", 1, 6)] {
-            let insert = sqlx::query("INSERT INTO images VALUES (?, ?, ?)").bind(id).bind(name).bind(camera);
-            insert.execute(&pool).await.expect("an image");
-            let rows = (0..3).flat_map(|k| {
-                let mut row = vec![0.0; columns];
-                (row[0], row[1]) = (10.0 * id as f32 + k as f32 + 0.5, 100.5);
-                row
-            });
-            sqlx::query("INSERT INTO keypoints VALUES (?, 3, ?, ?)")
-                .bind(id)
-                .bind(columns as i64)
-                .bind(floats(&rows.collect::<Vec<f32>>()))
-                .execute(&pool)
-                .await
-                .expect("keypoints");
-        }
-        for statement in more {
-            sqlx::raw_sql(*statement).execute(&pool).await.expect("a valid statement");
-        }
-        pool.close().await;
-    });
+    let connection = Connection::open(&path).expect("a database");
+    connection.execute_batch(SCHEMA).expect("the schema");
+    for (id, prior) in [(1, 1), (2, 0)] {
+        let parameters = doubles(&[700.0, 320.0, 240.0, 0.0]);
+        let insert = "INSERT INTO cameras VALUES (?, 2, 640, 480, ?, ?)";
+        connection.execute(insert, params![id, parameters, prior]).expect("a camera");
+    }
+    for (id, name, camera, columns) in [(1, "c.jpg", 1, 2), (2, "b.jpg", 2, 4), (5, "a.jpg", 1, 6)] {
+        connection.execute("INSERT INTO images VALUES (?, ?, ?)", params![id, name, camera]).expect("an image");
+        let rows = (0..3).flat_map(|k| {
+            let mut row = vec![0.0; columns];
+            (row[0], row[1]) = (10.0 * id as f32 + k as f32 + 0.5, 100.5);
+            row
+        });
+        let rows = floats(&rows.collect::<Vec<f32>>());
+        let insert = "INSERT INTO keypoints VALUES (?, 3, ?, ?)";
+        connection.execute(insert, params![id, columns as i64, rows]).expect("keypoints");
+    }
+    for statement in more {
+        connection.execute_batch(statement).expect("a valid statement");
+    }
+    drop(connection);
     (directory, path)
 }
 
-fn run<T>(work: impl Future<Output = T>) -> T {
-    tokio::runtime::Builder::new_current_thread().enable_all().build().expect("a runtime").block_on(work)
-}
-
-async fn open(path: &Path) -> SqlitePool {
-    let options =
-        SqliteConnectOptions::new().filename(path).create_if_missing(true).journal_mode(SqliteJournalMode::Delete);
-    SqlitePoolOptions::new().max_connections(1).connect_with(options).await.expect("a database")
-}
-
-/// The same with matches in a table: `(first, second, [(keypoint, keypoint)])`.
 /// Two image ids and the matches of their keypoints.
 type Pair<'a> = (i64, i64, &'a [(u32, u32)]);
 
+/// The same with matches in a table: `(first, second, [(keypoint, keypoint)])`.
 fn with_matches(table: &str, pairs: &[Pair]) -> (TempDir, PathBuf) {
     let (directory, path) = database(&[]);
     add_matches(&path, table, pairs);
@@ -84,24 +62,16 @@ fn with_matches(table: &str, pairs: &[Pair]) -> (TempDir, PathBuf) {
 }
 
 fn add_matches(path: &Path, table: &str, pairs: &[Pair]) {
-    run(async {
-        let pool = open(path).await;
-        for (first, second, found) in pairs {
-            let bytes: Vec<u8> = found.iter().flat_map(|&(a, b)| [a, b]).flat_map(u32::to_le_bytes).collect();
-            let insert = match table {
-                "matches" => "INSERT INTO matches VALUES (?, ?, 2, ?)",
-                _ => "INSERT INTO two_view_geometries VALUES (?, ?, 2, ?, 3)",
-            };
-            sqlx::query(insert)
-                .bind(first * MAX_IMAGES + second)
-                .bind(found.len() as i64)
-                .bind(bytes)
-                .execute(&pool)
-                .await
-                .expect("matches");
-        }
-        pool.close().await;
-    });
+    let connection = Connection::open(path).expect("a database");
+    for (first, second, found) in pairs {
+        let bytes: Vec<u8> = found.iter().flat_map(|&(a, b)| [a, b]).flat_map(u32::to_le_bytes).collect();
+        let insert = match table {
+            "matches" => "INSERT INTO matches VALUES (?, ?, 2, ?)",
+            _ => "INSERT INTO two_view_geometries VALUES (?, ?, 2, ?, 3)",
+        };
+        let values = params![first * MAX_IMAGES + second, found.len() as i64, bytes];
+        connection.execute(insert, values).expect("matches");
+    }
 }
 
 fn refusal(path: &Path, matches: Option<Matches>) -> String {
@@ -198,7 +168,7 @@ fn what_is_wrong_is_named_by_table_and_row() {
         wrong("INSERT INTO matches VALUES (1, 1, 2, x'0000000000000000')").contains("row 1: is of the images 0 and 1")
     );
     assert!(wrong("INSERT INTO matches VALUES (-7, 1, 2, x'00')").contains("pair_id: -7 is out of range"));
-    // SQLite's own words for bytes that are no schema; sqlx panics on a declared type like this one when asked for it.
+    // A declared type that is no text is none that is asked for.
     let (_directory, path) = with_matches("matches", &CHAIN);
     let bytes = fs::read(&path).expect("a file");
     let place = bytes.windows(12).position(|part| part == b"rows INTEGER").expect("the schema") + 6;
@@ -242,8 +212,7 @@ fn files_that_are_no_finished_database_say_so() {
 fn reading_leaves_the_file_and_its_directory_as_they_were() {
     let (directory, path) = with_matches("matches", &CHAIN);
     let before = fs::read(&path).expect("a file");
-    // A caller on a runtime, as the command line is.
-    run(async { read(&path, &Limits::default(), None).expect("valid") });
+    read(&path, &Limits::default(), None).expect("valid");
     assert_eq!(fs::read(&path).expect("a file"), before);
     assert_eq!(fs::read_dir(directory.path()).expect("a directory").count(), 1);
 }

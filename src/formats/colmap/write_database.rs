@@ -6,13 +6,12 @@ use std::fs::File;
 use std::io;
 use std::path::Path;
 
-use sqlx::sqlite::SqliteSynchronous;
-use sqlx::sqlite::{SqliteArguments, SqliteConnectOptions, SqliteConnection, SqliteJournalMode, SqliteLockingMode};
-use sqlx::{Arguments, ConnectOptions, Connection};
+use rusqlite::types::Value;
+use rusqlite::{Connection, OpenFlags, params, params_from_iter};
 
 use super::cameras::Model;
 use super::database::rows::{self, MAX_IMAGES, for_each_row};
-use super::database::{refuse_unfinished, run_apart};
+use super::database::{distrust, refuse_unfinished};
 use super::intrinsics;
 use super::two_view::{self, Geometry, Pair};
 use crate::domain::{Calibration, Grade, Solution};
@@ -40,7 +39,7 @@ pub fn write(target: &Path, solution: &Solution, input: &LabelledInput) -> Resul
     refuse_unfinished(&input.path)?;
     copied().map_err(|error| format!("the database cannot be copied: {error}"))?;
     refuse_unfinished(&input.path)?;
-    run_apart(async || change(target, &pairs, &cameras, input).await).map_err(|problem| match problem.column {
+    change(target, &pairs, &cameras, input).map_err(|problem| match problem.column {
         place if place.is_empty() => format!("the database {}", problem.description),
         place => format!("the database: {place}: {}", problem.description),
     })
@@ -67,48 +66,51 @@ fn cameras(solution: &Solution, input: &LabelledInput) -> BTreeMap<u32, (&'stati
     found.into_iter().filter_map(|(id, parameters)| Some((id, parameters?))).collect()
 }
 
-async fn change(
+fn change(
     path: &Path,
     pairs: &[Pair],
     cameras: &BTreeMap<u32, (&'static str, Vec<f64>)>,
     input: &LabelledInput,
 ) -> Result<(), Problem> {
-    let options = SqliteConnectOptions::new()
-        .filename(path)
-        // Alone with the file, which has no name yet and is synced as a whole when it is done.
-        .locking_mode(SqliteLockingMode::Exclusive)
-        .journal_mode(SqliteJournalMode::Delete)
-        .synchronous(SqliteSynchronous::Off)
-        .foreign_keys(false)
-        .pragma("trusted_schema", "0")
-        .disable_statement_logging();
-    let mut connection = options.connect().await.map_err(failed)?;
-    refuse_others(&mut connection, input).await?;
-    let verified = known_pairs(&mut connection).await?;
-    let insert = Insert::into(&mut connection).await?;
-    let mut transaction = connection.begin().await.map_err(failed)?;
+    let mut connection = open(path).map_err(failed)?;
+    refuse_others(&connection, input)?;
+    let verified = known_pairs(&connection)?;
+    let insert = Insert::into(&connection)?;
+    let transaction = connection.transaction().map_err(failed)?;
     for (id, (name, parameters)) in cameras {
         // Every name that `parameters` gives is one of COLMAP's.
         let Some(model) = Model::of_name(name) else { continue };
         let query = "UPDATE cameras SET model = ?, params = ?, prior_focal_length = 1 WHERE camera_id = ?";
-        let query = sqlx::query(query).bind(model.id).bind(blob(parameters)).bind(i64::from(*id));
-        query.execute(&mut *transaction).await.map_err(failed)?;
+        transaction.execute(query, params![model.id, blob(parameters), id]).map_err(failed)?;
     }
-    sqlx::query("DELETE FROM two_view_geometries").execute(&mut *transaction).await.map_err(failed)?;
+    transaction.execute("DELETE FROM two_view_geometries", []).map_err(failed)?;
     let mut left = verified;
     for pair in pairs {
         let id = pair_id(pair.images);
         left.remove(&id);
-        insert.run(&mut transaction, id, Some(pair)).await?;
+        insert.run(&transaction, id, Some(pair)).map_err(failed)?;
     }
     for id in left {
-        insert.run(&mut transaction, id, None).await?;
+        insert.run(&transaction, id, None).map_err(failed)?;
     }
-    transaction.commit().await.map_err(failed)?;
-    connection.close().await.map_err(failed)
+    transaction.commit().map_err(failed)?;
+    connection.close().map_err(|(_, error)| failed(error))
 }
 
-fn failed(error: sqlx::Error) -> Problem {
+/// Opens the copy: alone with the file, which has no name yet and is synced as a whole when it is done.
+fn open(path: &Path) -> rusqlite::Result<Connection> {
+    let flags = OpenFlags::SQLITE_OPEN_READ_WRITE | OpenFlags::SQLITE_OPEN_NO_MUTEX;
+    let connection = Connection::open_with_flags(path, flags)?;
+    distrust(&connection)?;
+    for (name, value) in
+        [("locking_mode", "EXCLUSIVE"), ("journal_mode", "DELETE"), ("synchronous", "OFF"), ("foreign_keys", "OFF")]
+    {
+        connection.pragma_update(None, name, value)?;
+    }
+    Ok(connection)
+}
+
+fn failed(error: rusqlite::Error) -> Problem {
     Problem::of_file(format!("cannot be changed: {error}"))
 }
 
@@ -118,8 +120,8 @@ fn pair_id([first, second]: [u32; 2]) -> i64 {
 }
 
 /// Refuses a database that is not the one that was read, and one whose triggers would run at every change.
-async fn refuse_others(connection: &mut SqliteConnection, input: &LabelledInput) -> Result<(), Problem> {
-    let tables = rows::tables(connection).await?;
+fn refuse_others(connection: &Connection, input: &LabelledInput) -> Result<(), Problem> {
+    let tables = rows::tables(connection)?;
     if !["cameras", "images", "keypoints", "two_view_geometries"].iter().all(|table| tables.contains(*table)) {
         return Err(Problem::of_file("has no table `two_view_geometries`, or has another in its place"));
     }
@@ -128,19 +130,17 @@ async fn refuse_others(connection: &mut SqliteConnection, input: &LabelledInput)
     for_each_row(connection, query, |row| {
         triggers = rows::integer(row, "sqlite_master", "count", 0)?;
         Ok(())
-    })
-    .await?;
+    })?;
     if triggers > 0u64 {
         return Err(Problem::of_file("has triggers, which COLMAP's have not: it is not changed"));
     }
     let mut counts: BTreeMap<u32, u64> = BTreeMap::new();
-    let query = "SELECT +image_id AS image_id, +rows AS rows FROM keypoints";
+    let query = "SELECT image_id, rows FROM keypoints";
     for_each_row(connection, query, |row| {
         let id = rows::integer(row, "keypoints", "image_id", 0)?;
         counts.insert(id, rows::integer(row, "keypoints", "rows", id.into())?);
         Ok(())
-    })
-    .await?;
+    })?;
     let is_same = |count: u64, id: u32| counts.get(&id).copied().unwrap_or(0) == count;
     if !input.colmap_images.iter().all(|image| is_same(image.keypoints.len() as u64, image.id)) {
         return Err(Problem::of_file("was changed since it was read"));
@@ -150,19 +150,15 @@ async fn refuse_others(connection: &mut SqliteConnection, input: &LabelledInput)
 
 /// Numbers of the pairs that were verified or matched: those without a match that is kept get an empty geometry, as
 /// COLMAP gives them, so that it does not verify them again.
-async fn known_pairs(connection: &mut SqliteConnection) -> Result<BTreeSet<i64>, Problem> {
+fn known_pairs(connection: &Connection) -> Result<BTreeSet<i64>, Problem> {
     let mut pairs = BTreeSet::new();
-    let tables = rows::tables(connection).await?;
-    for (table, query) in [
-        ("two_view_geometries", "SELECT +pair_id AS pair_id FROM two_view_geometries"),
-        ("matches", "SELECT +pair_id AS pair_id FROM matches"),
-    ] {
+    let tables = rows::tables(connection)?;
+    for table in ["two_view_geometries", "matches"] {
         if tables.contains(table) {
-            for_each_row(connection, query, |row| {
+            for_each_row(connection, &format!("SELECT pair_id FROM {table}"), |row| {
                 pairs.insert(rows::integer(row, table, "pair_id", 0)?);
                 Ok(())
-            })
-            .await?;
+            })?;
         }
     }
     Ok(pairs)
@@ -177,15 +173,8 @@ enum Insert {
 }
 
 impl Insert {
-    async fn into(connection: &mut SqliteConnection) -> Result<Self, Problem> {
-        let mut columns = BTreeSet::new();
-        let query = "SELECT +name AS name FROM pragma_table_info('two_view_geometries')";
-        for_each_row(connection, query, |row| {
-            use sqlx::Row;
-            columns.extend(row.try_get::<String, _>("name"));
-            Ok(())
-        })
-        .await?;
+    fn into(connection: &Connection) -> Result<Self, Problem> {
+        let columns = rows::names(connection, "SELECT name FROM pragma_table_info('two_view_geometries')")?;
         let has = |names: &[&str]| names.iter().all(|name| columns.contains(*name));
         Ok(match () {
             () if has(&["F", "E", "H", "qvec", "tvec"]) => Insert::Poses,
@@ -211,22 +200,18 @@ impl Insert {
     }
 
     /// Inserts a pair, an empty one where there is no geometry.
-    async fn run(self, connection: &mut SqliteConnection, id: i64, pair: Option<&Pair>) -> Result<(), Problem> {
+    fn run(self, connection: &Connection, id: i64, pair: Option<&Pair>) -> rusqlite::Result<()> {
         let matches = pair.map(|pair| pair.matches.as_slice()).unwrap_or_default();
         let data: Vec<u8> = matches.as_flattened().iter().flat_map(|keypoint| keypoint.to_le_bytes()).collect();
         let Columns { config, matrices, rotation, translation } = Columns::of(pair.map(|pair| &pair.geometry));
-        let mut values = SqliteArguments::default();
-        let mut bound = values.add(id).and_then(|()| values.add(matches.len() as i64));
-        bound = bound.and_then(|()| values.add(data)).and_then(|()| values.add(config));
+        let mut values: Vec<Value> = vec![id.into(), (matches.len() as i64).into(), data.into(), config.into()];
         if self != Insert::Matches {
-            bound = matrices.into_iter().fold(bound, |bound, matrix| bound.and_then(|()| values.add(matrix)));
+            values.extend(matrices.map(Value::from));
         }
         if self == Insert::Poses {
-            bound = bound.and_then(|()| values.add(rotation)).and_then(|()| values.add(translation));
+            values.extend([rotation, translation].map(Value::from));
         }
-        bound.map_err(|error| Problem::of_file(format!("cannot be changed: {error}")))?;
-        let query = sqlx::query_with(self.statement(), values);
-        query.execute(connection).await.map(|_| ()).map_err(failed)
+        connection.prepare_cached(self.statement())?.execute(params_from_iter(values)).map(drop)
     }
 }
 

@@ -1,7 +1,7 @@
 use std::fs;
 use std::path::PathBuf;
 
-use sqlx::Row;
+use rusqlite::types::FromSql;
 use tempfile::TempDir;
 
 use super::super::database_fixture::{self, dress};
@@ -55,16 +55,20 @@ impl Case {
     }
 }
 
-/// The rows of a query, each column as bytes, text or number.
-fn rows(path: &Path, query: &'static str) -> Vec<Vec<u8>> {
-    database_fixture::on(path, async |pool| {
-        let rows = sqlx::query(query).fetch_all(pool).await.expect("rows");
-        rows.iter().map(|row| row.get::<Option<Vec<u8>>, _>(0).unwrap_or_default()).collect()
-    })
+/// The first column of a query's rows.
+fn column<T: FromSql>(path: &Path, query: &str) -> Vec<T> {
+    let connection = Connection::open(path).expect("a database");
+    let mut statement = connection.prepare(query).expect("a valid query");
+    statement.query_map([], |row| row.get(0)).and_then(Iterator::collect).expect("rows")
 }
 
-fn numbers(path: &Path, query: &'static str) -> Vec<i64> {
-    database_fixture::on(path, async |pool| sqlx::query_scalar(query).fetch_all(pool).await.expect("numbers"))
+/// The same of bytes; NULL is none.
+fn rows(path: &Path, query: &str) -> Vec<Vec<u8>> {
+    column::<Option<Vec<u8>>>(path, query).into_iter().map(Option::unwrap_or_default).collect()
+}
+
+fn numbers(path: &Path, query: &str) -> Vec<i64> {
+    column(path, query)
 }
 
 fn doubles(bytes: &[u8]) -> Vec<f64> {
@@ -149,10 +153,8 @@ fn a_database_that_cannot_be_changed_says_why() {
     let refused = Case::of(fixture::solved(), trigger).write().expect_err("a trigger");
     assert!(refused.contains("has triggers"), "{refused}");
     let case = Case::of(fixture::solved(), "");
-    database_fixture::on(&case.input.path, async |pool| {
-        let statement = "UPDATE keypoints SET rows = 1, data = x'0000000000000000' WHERE image_id = 2";
-        sqlx::raw_sql(statement).execute(pool).await.expect("changed");
-    });
+    let statement = "UPDATE keypoints SET rows = 1, data = x'0000000000000000' WHERE image_id = 2";
+    Connection::open(&case.input.path).and_then(|database| database.execute_batch(statement)).expect("changed");
     let refused = case.write().expect_err("another database");
     assert!(refused.contains("was changed since it was read"), "{refused}");
     fs::write(&case.input.path, "none").expect("written");

@@ -2,9 +2,8 @@
 
 use std::collections::{BTreeSet, HashMap, HashSet};
 
-use futures_util::TryStreamExt;
-use sqlx::sqlite::{SqliteConnection, SqliteRow};
-use sqlx::{Either, Executor, Row};
+use rusqlite::types::ValueRef;
+use rusqlite::{Connection, Row};
 
 use super::super::cameras::{Camera, Model};
 use super::super::images::{Frame, Images};
@@ -27,50 +26,42 @@ pub(super) fn table(kind: Matches) -> &'static str {
     }
 }
 
-fn damaged(error: sqlx::Error) -> Problem {
+fn damaged(error: rusqlite::Error) -> Problem {
     Problem::of_file(format!("cannot be read as a COLMAP database: {error}"))
 }
 
 /// Gives every row of a query to `each`.
-///
-/// # Pitfall
-/// Queries select expressions, `+column AS column`: sqlx asks SQLite for the declared types and names of plain columns,
-/// and its thread panics where a damaged schema has such that are not UTF-8. A stream of rows then just ends, and who asks
-/// that connection for more may wait for ever. So a stream that ends without its summary is an error, after which the
-/// connection must not be used.
-pub(in super::super) async fn for_each_row(
-    connection: &mut SqliteConnection,
-    query: &'static str,
-    mut each: impl FnMut(&SqliteRow) -> Result<(), Problem>,
+pub(in super::super) fn for_each_row(
+    connection: &Connection,
+    query: &str,
+    mut each: impl FnMut(&Row<'_>) -> Result<(), Problem>,
 ) -> Result<(), Problem> {
-    let mut steps = connection.fetch_many(sqlx::query(query));
-    let mut is_whole = false;
-    while let Some(step) = steps.try_next().await.map_err(damaged)? {
-        match step {
-            Either::Left(_summary) => is_whole = true,
-            Either::Right(row) => each(&row)?,
-        }
+    let mut statement = connection.prepare(query).map_err(damaged)?;
+    let mut rows = statement.query([]).map_err(damaged)?;
+    while let Some(row) = rows.next().map_err(damaged)? {
+        each(row)?;
     }
-    if is_whole { Ok(()) } else { Err(Problem::of_file("cannot be read as a COLMAP database: reading broke off")) }
+    Ok(())
 }
 
 /// The tables that a query may go to. Views and virtual tables are none: a query of one runs its maker's program.
-pub(in super::super) async fn tables(connection: &mut SqliteConnection) -> Result<BTreeSet<String>, Problem> {
-    let query = "SELECT +name AS name FROM sqlite_master WHERE type = 'table' AND sql NOT LIKE 'CREATE VIRTUAL%'";
-    let mut tables = BTreeSet::new();
-    for_each_row(connection, query, |row| {
-        // One whose name is no text is none of COLMAP's.
-        tables.extend(row.try_get::<String, _>("name"));
-        Ok(())
-    })
-    .await?;
-    Ok(tables)
+pub(in super::super) fn tables(connection: &Connection) -> Result<BTreeSet<String>, Problem> {
+    let query = "SELECT name FROM sqlite_master WHERE type = 'table' AND sql NOT LIKE 'CREATE VIRTUAL%'";
+    names(connection, query)
 }
 
-pub(super) async fn cameras(connection: &mut SqliteConnection, images: &mut Images) -> Result<(), Problem> {
-    let query =
-        "SELECT +camera_id AS camera_id, +model AS model, +width AS width, +height AS height, +params AS params,
-        +prior_focal_length AS prior_focal_length FROM cameras ORDER BY cameras.camera_id";
+/// The names that a query selects. One that is no text is none of COLMAP's.
+pub(in super::super) fn names(connection: &Connection, query: &str) -> Result<BTreeSet<String>, Problem> {
+    let mut names = BTreeSet::new();
+    for_each_row(connection, query, |row| {
+        names.extend(row.get::<_, String>("name"));
+        Ok(())
+    })?;
+    Ok(names)
+}
+
+pub(super) fn cameras(connection: &Connection, images: &mut Images) -> Result<(), Problem> {
+    let query = "SELECT camera_id, model, width, height, params, prior_focal_length FROM cameras ORDER BY camera_id";
     for_each_row(connection, query, |row| {
         let id: u32 = integer(row, "cameras", "camera_id", 0)?;
         let value = |column: &str| integer::<i64>(row, "cameras", column, id.into());
@@ -82,29 +73,24 @@ pub(super) async fn cameras(connection: &mut SqliteConnection, images: &mut Imag
             .and_then(|camera| images.add_camera(id, camera.knowing(first.filter(|_| is_known))))
             .map_err(|what| Problem::of_record(format!("table cameras, row {id}"), what))
     })
-    .await
 }
 
-pub(super) async fn images(connection: &mut SqliteConnection, most: usize, images: &mut Images) -> Result<(), Problem> {
-    let query = "SELECT +image_id AS image_id, +camera_id AS camera_id, +name AS name FROM images
-        ORDER BY images.image_id";
+pub(super) fn images(connection: &Connection, most: usize, images: &mut Images) -> Result<(), Problem> {
+    let query = "SELECT image_id, camera_id, name FROM images ORDER BY image_id";
     for_each_row(connection, query, |row| {
         let id: u32 = integer(row, "images", "image_id", 0)?;
         let wrong = |what: String| Problem::of_record(format!("table images, row {id}"), what);
         let camera = integer(row, "images", "camera_id", id.into())?;
-        let name: &str = row.try_get("name").map_err(|error| wrong(format!("name: {}", unwrapped(error))))?;
+        let name = cell(row, "images", "name", id.into())?;
+        let name = name.as_str().map_err(|error| wrong(format!("name: {error}")))?;
         images.add_image(id, name, camera).map_err(wrong)?;
         if images.len() > most { Err(wrong(format!("more images than the limit of {most}"))) } else { Ok(()) }
     })
-    .await
 }
 
 /// The frame of each image, where it has one of its own; `None`: a frame has several images.
-pub(super) async fn frames(
-    connection: &mut SqliteConnection,
-    images: &Images,
-) -> Result<Option<HashMap<u32, Frame>>, Problem> {
-    let query = "SELECT +data.data_id AS image_id, +frames.frame_id AS frame_id, +frames.rig_id AS rig_id
+pub(super) fn frames(connection: &Connection, images: &Images) -> Result<Option<HashMap<u32, Frame>>, Problem> {
+    let query = "SELECT data.data_id AS image_id, frames.frame_id AS frame_id, frames.rig_id AS rig_id
         FROM frame_data AS data JOIN frames ON frames.frame_id = data.frame_id WHERE data.sensor_type = 0
         ORDER BY data.data_id";
     let (mut frames, mut taken, mut is_trivial) = (HashMap::new(), HashSet::new(), true);
@@ -117,8 +103,7 @@ pub(super) async fn frames(
         let frame = Frame { id: number("frame_id")?, rig: number("rig_id")? };
         is_trivial &= taken.insert(frame.id) && frames.insert(id, frame).is_none();
         Ok(())
-    })
-    .await?;
+    })?;
     Ok(is_trivial.then_some(frames))
 }
 
@@ -153,11 +138,10 @@ impl Keypoints {
     }
 }
 
-pub(super) async fn keypoints(connection: &mut SqliteConnection, images: &Images) -> Result<Keypoints, Problem> {
+pub(super) fn keypoints(connection: &Connection, images: &Images) -> Result<Keypoints, Problem> {
     let mut of_image: Vec<Vec<[f32; 2]>> = vec![Vec::new(); images.len()];
     let mut count = 0;
-    let query = "SELECT +image_id AS image_id, +rows AS rows, +cols AS cols, +data AS data FROM keypoints
-        ORDER BY keypoints.image_id";
+    let query = "SELECT image_id, rows, cols, data FROM keypoints ORDER BY image_id";
     for_each_row(connection, query, |row| {
         let id: u32 = integer(row, "keypoints", "image_id", 0)?;
         let wrong = |what: &str| Problem::of_record(format!("table keypoints, row {id}"), what);
@@ -169,8 +153,7 @@ pub(super) async fn keypoints(connection: &mut SqliteConnection, images: &Images
         count += of_image[image as usize].len();
         let fits = count <= MAX_KEYPOINTS;
         if fits { Ok(()) } else { Err(wrong(&format!("more keypoints than {MAX_KEYPOINTS} in all"))) }
-    })
-    .await?;
+    })?;
     let mut starts = vec![0];
     let mut points = Vec::with_capacity(count);
     for of_image in of_image {
@@ -181,30 +164,21 @@ pub(super) async fn keypoints(connection: &mut SqliteConnection, images: &Images
 }
 
 /// The matches of a kind. Views are the positions of the images.
-pub(super) async fn matches(
-    connection: &mut SqliteConnection,
+pub(super) fn matches(
+    connection: &Connection,
     kind: Matches,
     images: &Images,
     keypoints: &Keypoints,
 ) -> Result<PairMatches, Problem> {
-    let query = match kind {
-        Matches::Verified => {
-            "SELECT +pair_id AS pair_id, +rows AS rows, +cols AS cols, +data AS data FROM two_view_geometries AS pairs
-             WHERE pairs.rows <> 0 ORDER BY pairs.pair_id"
-        }
-        Matches::Raw => {
-            "SELECT +pair_id AS pair_id, +rows AS rows, +cols AS cols, +data AS data FROM matches AS pairs
-             WHERE pairs.rows <> 0 ORDER BY pairs.pair_id"
-        }
-    };
+    let query = format!("SELECT pair_id, rows, cols, data FROM {} WHERE rows <> 0 ORDER BY pair_id", table(kind));
     let mut matches = PairMatches::default();
-    for_each_row(connection, query, |row| of_pair(row, table(kind), images, keypoints, &mut matches)).await?;
+    for_each_row(connection, &query, |row| of_pair(row, table(kind), images, keypoints, &mut matches))?;
     Ok(matches)
 }
 
 /// Takes the matches of one image pair, each once.
 fn of_pair(
-    row: &SqliteRow,
+    row: &Row<'_>,
     table: &str,
     images: &Images,
     keypoints: &Keypoints,
@@ -243,31 +217,43 @@ fn pair(row: &[u8]) -> [[u8; 4]; 2] {
     [[row[0], row[1], row[2], row[3]], [row[4], row[5], row[6], row[7]]]
 }
 
-/// An integer of a row. `id` names the row in errors.
+/// What a row has in a column. `id` names the row in errors.
+fn cell<'r>(row: &'r Row<'_>, table: &str, column: &str, id: u64) -> Result<ValueRef<'r>, Problem> {
+    row.get_ref(column)
+        .map_err(|error| Problem::of_record(format!("table {table}, row {id}: {column}"), error.to_string()))
+}
+
+/// An integer of a row.
 pub(in super::super) fn integer<T: TryFrom<i64>>(
-    row: &SqliteRow,
+    row: &Row<'_>,
     table: &str,
     column: &str,
     id: u64,
 ) -> Result<T, Problem> {
     let wrong = |what: String| Problem::of_record(format!("table {table}, row {id}: {column}"), what);
-    let value: i64 = row.try_get(column).map_err(|error| wrong(unwrapped(error)))?;
-    T::try_from(value).map_err(|_| wrong(format!("{value} is out of range")))
+    match cell(row, table, column, id)? {
+        ValueRef::Integer(value) => T::try_from(value).map_err(|_| wrong(format!("{value} is out of range"))),
+        other => Err(wrong(format!("is of the type {}, not Integer", other.data_type()))),
+    }
 }
 
 /// A blob of a row; NULL is an empty one.
-fn blob<'r>(row: &'r SqliteRow, table: &str, column: &str, id: u64) -> Result<&'r [u8], Problem> {
-    let value: Option<&[u8]> = row
-        .try_get(column)
-        .map_err(|error| Problem::of_record(format!("table {table}, row {id}: {column}"), unwrapped(error)))?;
-    Ok(value.unwrap_or_default())
+fn blob<'r>(row: &'r Row<'_>, table: &str, column: &str, id: u64) -> Result<&'r [u8], Problem> {
+    match cell(row, table, column, id)? {
+        ValueRef::Blob(bytes) => Ok(bytes),
+        ValueRef::Null => Ok(&[]),
+        other => {
+            let place = format!("table {table}, row {id}: {column}");
+            Err(Problem::of_record(place, format!("is of the type {}, not Blob", other.data_type())))
+        }
+    }
 }
 
 /// Columns of keypoints (x, y) and of matches (a keypoint of either image) that there must be.
 const LEAST_COLUMNS: usize = 2;
 
 /// The columns and the bytes of a matrix of four-byte numbers.
-fn matrix<'r>(row: &'r SqliteRow, table: &str, id: u64) -> Result<(usize, &'r [u8]), Problem> {
+fn matrix<'r>(row: &'r Row<'_>, table: &str, id: u64) -> Result<(usize, &'r [u8]), Problem> {
     let (rows, columns): (u64, usize) = (integer(row, table, "rows", id)?, integer(row, table, "cols", id)?);
     let data = blob(row, table, "data", id)?;
     let wrong = |what: String| Problem::of_record(format!("table {table}, row {id}: data"), what);
@@ -280,12 +266,4 @@ fn matrix<'r>(row: &'r SqliteRow, table: &str, id: u64) -> Result<(usize, &'r [u
     }
     // An empty matrix may have any number of columns.
     Ok((if data.is_empty() { LEAST_COLUMNS } else { columns }, data))
-}
-
-/// What went wrong with a column, without sqlx's words around it.
-fn unwrapped(error: sqlx::Error) -> String {
-    match error {
-        sqlx::Error::ColumnDecode { source, .. } => source.to_string(),
-        error => error.to_string(),
-    }
 }
