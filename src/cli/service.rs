@@ -192,7 +192,7 @@ async fn open_store(config: &config::Store) -> Result<Arc<Store>, Failure> {
     }
     let directory = config.data_dir.display();
     let failed = |error| Failure::internal(format_args!("cannot open the data directory {directory}: {error}"));
-    Ok(Arc::new(Sqlite::open(&config.data_dir).await.map_err(failed)?))
+    Ok(Arc::new(Sqlite::open(&config.data_dir).map_err(failed)?))
 }
 
 /// A bound that 0 lifts.

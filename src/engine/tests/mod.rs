@@ -228,7 +228,7 @@ impl TestEngine {
 
 async fn start(options: Options, directory: &TempDir, solver: &Arc<FakeSolver>) -> (Engine, Arc<Sqlite>) {
     // The engine before may still be letting go of the directory.
-    let store = eventually(|| async { Sqlite::open(directory.path()).await.ok() }).await;
+    let store = eventually(|| async { Sqlite::open(directory.path()).ok() }).await;
     let store = Arc::new(store);
     let engine = Engine::start(options, store.clone(), solver.solver_fn(), encode).await.expect("starts");
     (engine, store)

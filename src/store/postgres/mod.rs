@@ -3,6 +3,7 @@
 //! Every write of a worker is conditioned on its lease under the job's row lock, so that of two servers that think they
 //! hold a job one is refused. Notifications carry the names of jobs: what they say is read from the tables.
 
+mod connection;
 mod listener;
 #[cfg(test)]
 mod locks_tests;
@@ -18,7 +19,7 @@ use tokio::sync::Mutex;
 use tokio::time::{Instant, timeout};
 
 use super::clock::LeaseClock;
-use super::sql::{self, Connection, Database, Lock, Operation, Row, Size, Statement, WriteIntent};
+use super::sql::{Connection, Database, Operation, Size, Statement, WriteIntent};
 use super::{Clock, Error, Notification};
 use listener::Listener;
 pub use url::{DatabaseUrl, UrlError};
@@ -51,11 +52,6 @@ const SESSION: [(&str, &str); 6] = [
     ("tcp_keepalives_interval", "10"),
     ("tcp_keepalives_count", "3"),
 ];
-
-/// Key of the advisory lock under which jobs are admitted: any constant does that others do not use, `scpsfm` in ASCII.
-const ADMISSION_LOCK: i64 = 0x7363_7073_666d;
-/// The same for claims that must not pass a bound together.
-const CLAIMS_LOCK: i64 = ADMISSION_LOCK + 1;
 
 /// Store in a PostgreSQL database.
 #[derive(Debug)]
@@ -98,7 +94,7 @@ impl Postgres {
 
     fn pool(&self, size: Size) -> &PgPool {
         match size {
-            Size::Small | Size::Outcome => &self.pool,
+            Size::Small | Size::Page | Size::Outcome => &self.pool,
             Size::Payload => &self.payloads,
         }
     }
@@ -125,31 +121,6 @@ fn pool_of(connections: u32) -> PgPoolOptions {
                 }
             })
         })
-}
-
-#[async_trait::async_trait]
-impl Connection for PgConnection {
-    fn writes_alone(&self) -> bool {
-        false
-    }
-
-    async fn rows(&mut self, statement: Statement) -> Result<Vec<Row>, Error> {
-        sql::run::<sqlx::Postgres>(self, statement).await
-    }
-
-    async fn take_lock(&mut self, lock: Lock) -> Result<(), Error> {
-        let key = match lock {
-            Lock::Admission => ADMISSION_LOCK,
-            Lock::Claims => CLAIMS_LOCK,
-        };
-        self.rows(Statement::new("SELECT pg_advisory_xact_lock($1)").bind(key)).await.map(drop)
-    }
-
-    async fn notify(&mut self, notification: Notification) -> Result<(), Error> {
-        let Some((channel, payload)) = listener::message(&notification) else { return Ok(()) };
-        let notify = Statement::new("SELECT pg_notify($1, $2)").bind(channel).bind(&payload);
-        self.rows(notify).await.map(drop)
-    }
 }
 
 #[async_trait::async_trait]
@@ -181,7 +152,7 @@ impl Database for Postgres {
 
     fn bound(&self, size: Size) -> Option<Duration> {
         Some(match size {
-            Size::Small => SMALL_BOUND,
+            Size::Small | Size::Page => SMALL_BOUND,
             Size::Payload | Size::Outcome => PAYLOAD_BOUND,
         })
     }

@@ -3,7 +3,7 @@
 
 use std::time::Duration;
 
-use sqlx::migrate::Migrate;
+use sqlx::migrate::{Migrate, MigrateError};
 use sqlx::postgres::{PgConnectOptions, PgConnection};
 use tokio::time::{Instant, timeout};
 
@@ -46,7 +46,7 @@ async fn migrate(options: &PgConnectOptions, steps: &[Step], lock_timeout: Durat
     // The lock ends with the connection, however this does.
     let mut migrator = sql::migrator(steps);
     migrator.set_locking(false);
-    let migrated = migrator.run(&mut connection).await.map_err(sql::migration_failed);
+    let migrated = migrator.run(&mut connection).await.map_err(failed);
     // What was done is committed: there is nothing to lose with the connection.
     let _ = timeout(ACQUIRE_TIMEOUT, sqlx::Connection::close(connection)).await;
     migrated
@@ -64,7 +64,7 @@ async fn lock(connection: &mut PgConnection, lock_timeout: Duration) -> Result<(
     loop {
         match timeout(LOG_PERIOD, &mut lock).await {
             Ok(Err(error)) if is_late(&error) => return Err(too_long()),
-            Ok(locked) => return locked.map_err(sql::migration_failed),
+            Ok(locked) => return locked.map_err(failed),
             // The database ends the wait by itself, unless it has gone away meanwhile.
             Err(_) if begun.elapsed() > lock_timeout + ACQUIRE_TIMEOUT => return Err(too_long()),
             Err(_) => tracing::info!(
@@ -83,10 +83,18 @@ async fn bound_locks(connection: &mut PgConnection, bound: Duration) -> Result<(
     connection.rows(set).await.map(drop)
 }
 
-fn is_late(error: &sqlx::migrate::MigrateError) -> bool {
-    use sqlx::migrate::MigrateError::Execute;
-    let Execute(error) = error else { return false };
+fn is_late(error: &MigrateError) -> bool {
+    let MigrateError::Execute(error) = error else { return false };
     error.as_database_error().and_then(|cause| cause.code()).as_deref() == Some(LOCK_NOT_AVAILABLE)
+}
+
+/// Why the schema cannot be brought up to date.
+fn failed(error: MigrateError) -> Error {
+    match error {
+        MigrateError::Execute(error) | MigrateError::ExecuteMigration(error, _) => error.into(),
+        MigrateError::VersionMissing(step) | MigrateError::VersionMismatch(step) => sql::other_version(step),
+        error => Error::Corrupt(format!("cannot bring the schema up to date: {error}")),
+    }
 }
 
 #[cfg(test)]

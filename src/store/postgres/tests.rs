@@ -9,6 +9,7 @@ use std::sync::Arc;
 
 use super::*;
 use crate::domain::job::{JobName, JobState};
+use crate::store::sql::Lock;
 use crate::store::{Claim, contract};
 use cluster::Cluster;
 

@@ -21,11 +21,10 @@ use std::time::{Duration, SystemTime};
 use futures_util::future::BoxFuture;
 use sqlx::SqlSafeStr;
 use sqlx::migrate::{Migration, MigrationType, Migrator};
-use sqlx::pool::PoolConnection;
 
 use super::{Error, Notification};
 pub(super) use rows::{micros, time};
-pub(super) use statement::{Row, Statement, Value, run};
+pub(super) use statement::{Row, Statement, Value};
 
 /// A connection to a database, within a transaction or not: unless it says otherwise, one that has the database to
 /// itself when it writes.
@@ -84,28 +83,6 @@ impl dyn Connection + '_ {
     /// Runs a statement that has no rows.
     pub(super) async fn execute(&mut self, statement: Statement) -> Result<(), Error> {
         self.rows(statement).await.map(drop)
-    }
-}
-
-#[async_trait::async_trait]
-impl<D: sqlx::Database> Connection for PoolConnection<D>
-where
-    D::Connection: Connection,
-{
-    fn writes_alone(&self) -> bool {
-        (**self).writes_alone()
-    }
-
-    async fn rows(&mut self, statement: Statement) -> Result<Vec<Row>, Error> {
-        (**self).rows(statement).await
-    }
-
-    async fn take_lock(&mut self, lock: Lock) -> Result<(), Error> {
-        (**self).take_lock(lock).await
-    }
-
-    async fn notify(&mut self, notification: Notification) -> Result<(), Error> {
-        (**self).notify(notification).await
     }
 }
 
@@ -185,8 +162,10 @@ pub trait Database: Send + Sync + 'static {
 /// What an operation moves.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Size {
-    /// A few rows.
+    /// A few rows, found by their keys.
     Small,
+    /// A page of a listing, or what is counted over all jobs.
+    Page,
     /// An input or a result, for a caller who can wait.
     Payload,
     /// A result, under a lease that may run out.
@@ -227,23 +206,12 @@ pub(super) fn migrator(steps: &[Step]) -> Migrator {
     Migrator::with_migrations(migrations)
 }
 
-/// Why the schema cannot be brought up to date.
-pub(super) fn migration_failed(error: sqlx::migrate::MigrateError) -> Error {
-    use sqlx::migrate::MigrateError::{Execute, ExecuteMigration, VersionMismatch, VersionMissing};
-    match error {
-        Execute(error) | ExecuteMigration(error, _) => error.into(),
-        VersionMissing(step) | VersionMismatch(step) => Error::Corrupt(format!(
-            "step {step} of its schema is not of this version: it is the store of a newer server, or of an \
-             earlier build. Let that build end its jobs, and begin with a new data directory or database"
-        )),
-        error => Error::Corrupt(format!("cannot bring the schema up to date: {error}")),
-    }
-}
-
-/// Whether a database refused for a reason that waiting does not mend: SQLSTATE classes 22 (data), 23 (integrity) and
-/// 42 (syntax or access), which have five signs. SQLite's codes, numbers, are none of these.
-fn is_defect(code: Option<&str>) -> bool {
-    code.is_some_and(|code| code.len() == 5 && ["22", "23", "42"].iter().any(|class| code.starts_with(class)))
+/// A database that took a step which these migrations do not have, or have otherwise.
+pub(super) fn other_version(step: i64) -> Error {
+    Error::Corrupt(format!(
+        "step {step} of its schema is not of this version: it is the store of a newer server, or of an earlier build. \
+         Let that build end its jobs, and begin with a new data directory or database"
+    ))
 }
 
 /// SQLite's primary code is the low byte of the one that it gives (sqlite.org/rescode.html): 13, `SQLITE_FULL`; the
@@ -270,22 +238,6 @@ pub(super) fn by_code(code: &str, text: String) -> Result<Error, String> {
         return Ok(Error::NoSpace(text));
     }
     if is_damaged(code) { Ok(Error::Corrupt(text)) } else { Err(text) }
-}
-
-impl From<sqlx::Error> for Error {
-    fn from(error: sqlx::Error) -> Self {
-        let code = error.as_database_error().and_then(|cause| cause.code()).unwrap_or_default();
-        if let Ok(error) = by_code(&code, error.to_string()) {
-            return error;
-        }
-        match error {
-            sqlx::Error::ColumnDecode { .. } | sqlx::Error::ColumnNotFound(_) | sqlx::Error::Decode(_) => {
-                Error::Corrupt(error.to_string())
-            }
-            sqlx::Error::Database(ref cause) if is_defect(cause.code().as_deref()) => Error::Corrupt(error.to_string()),
-            _ => Error::Unavailable(error.to_string()),
-        }
-    }
 }
 
 #[cfg(test)]

@@ -129,7 +129,7 @@ mod tests {
         let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build().expect("a runtime");
         let late = async {
             let directory = tempfile::tempdir().expect("a temporary directory");
-            let store = Sqlite::open(directory.path()).await.expect("opens");
+            let store = Sqlite::open(directory.path()).expect("opens");
             store.create_job(contract::record("a"), &contract::ROOM, contract::time(0)).await.expect("created");
             let claim = Claim::one("w", Duration::from_secs(1));
             let claims = store.claim(&claim, contract::time(0)).await.expect("claims");

@@ -1,11 +1,7 @@
 //! A statement with its values, and the rows it gives, in terms that every database has.
 
+use std::borrow::Cow;
 use std::sync::Arc;
-
-use sqlx::{
-    Column, ColumnIndex, Decode, Encode, Executor, IntoArguments, Row as _, SqlSafeStr, SqlStr, Type, TypeInfo,
-    ValueRef,
-};
 
 use crate::store::Error;
 
@@ -31,17 +27,22 @@ impl Value {
 /// SQL with the values of its parameters `$1`, `$2`, ...
 #[derive(Debug, Clone)]
 pub struct Statement {
-    sql: SqlStr,
+    sql: Cow<'static, str>,
     values: Vec<Value>,
 }
 
 impl Statement {
     pub(in crate::store) fn new(sql: &'static str) -> Self {
-        Self { sql: sql.into_sql_str(), values: Vec::new() }
+        Self { sql: sql.into(), values: Vec::new() }
     }
 
     pub(in crate::store) fn sql(&self) -> &str {
-        self.sql.as_str()
+        &self.sql
+    }
+
+    /// Its SQL, which is made of constants alone, and its values.
+    pub(in crate::store) fn into_parts(self) -> (Cow<'static, str>, Vec<Value>) {
+        (self.sql, self.values)
     }
 
     /// Of its parameters, in their order.
@@ -56,27 +57,25 @@ impl Statement {
     }
 
     /// More SQL at the end.
-    pub(in crate::store) fn then(self, sql: &'static str) -> Self {
-        if sql.is_empty() {
-            return self;
+    pub(in crate::store) fn then(mut self, sql: &'static str) -> Self {
+        if !sql.is_empty() {
+            self.sql.to_mut().push_str(sql);
         }
-        let text = [self.sql.as_str(), sql].concat();
-        // Only constants come together here.
-        Self { sql: sqlx::AssertSqlSafe(text).into_sql_str(), ..self }
-    }
-
-    /// The same with other words in it, as a defect would have it.
-    #[cfg(test)]
-    pub(in crate::store) fn replaced(self, from: &str, to: &str) -> Self {
-        Self { sql: sqlx::AssertSqlSafe(self.sql.as_str().replace(from, to)).into_sql_str(), ..self }
+        self
     }
 
     /// A parameter at the end of the SQL, with its value.
     pub(in crate::store) fn then_bind(self, value: impl Into<Value>) -> Self {
         let mut statement = self.bind(value);
-        let text = format!("{}${}", statement.sql.as_str(), statement.values.len());
-        statement.sql = sqlx::AssertSqlSafe(text).into_sql_str();
+        let parameter = format!("${}", statement.values.len());
+        statement.sql.to_mut().push_str(&parameter);
         statement
+    }
+
+    /// The same with other words in it, as a defect would have it.
+    #[cfg(test)]
+    pub(in crate::store) fn replaced(self, from: &str, to: &str) -> Self {
+        Self { sql: self.sql.replace(from, to).into(), ..self }
     }
 }
 
@@ -101,57 +100,6 @@ value_from! {
     Vec<u8> => Bytes: Some,
     &[u8] => Bytes: |value: &[u8]| Some(value.to_vec()),
     Option<Vec<u8>> => Bytes: std::convert::identity,
-}
-
-/// Runs a statement on a connection of sqlx.
-pub(in crate::store) async fn run<'c, D>(
-    connection: &'c mut D::Connection,
-    statement: Statement,
-) -> Result<Vec<Row>, Error>
-where
-    D: sqlx::Database,
-    D::Arguments: IntoArguments<D>,
-    &'c mut D::Connection: Executor<'c, Database = D>,
-    usize: ColumnIndex<D::Row>,
-    bool: for<'r> Decode<'r, D> + Type<D>,
-    i64: for<'r> Decode<'r, D> + Type<D>,
-    String: for<'r> Decode<'r, D> + Type<D>,
-    Vec<u8>: for<'r> Decode<'r, D> + Type<D>,
-    Option<i64>: for<'q> Encode<'q, D> + Type<D>,
-    Option<String>: for<'q> Encode<'q, D> + Type<D>,
-    Option<Vec<u8>>: for<'q> Encode<'q, D> + Type<D>,
-{
-    let mut query = sqlx::query::<D>(statement.sql);
-    for value in statement.values {
-        query = match value {
-            Value::Integer(value) => query.bind(value),
-            Value::Text(value) => query.bind(value),
-            Value::Bytes(value) => query.bind(value),
-        };
-    }
-    let rows = query.fetch_all(connection).await?;
-    let Some(first) = rows.first() else { return Ok(Vec::new()) };
-    let columns: Arc<[String]> = first.columns().iter().map(|column| column.name().to_owned()).collect();
-    let cell = |row: &D::Row, place: usize| {
-        let raw = row.try_get_raw(place)?;
-        if raw.is_null() {
-            return Ok(Value::Integer(None));
-        }
-        // The names that SQLite and PostgreSQL have for these types.
-        match raw.type_info().name() {
-            "INTEGER" | "INT8" => Ok(Value::Integer(row.try_get(place)?)),
-            "BOOLEAN" | "BOOL" => Ok(Value::Integer(Some(row.try_get::<bool, _>(place)?.into()))),
-            "TEXT" => Ok(Value::Text(row.try_get(place)?)),
-            "BLOB" | "BYTEA" => Ok(Value::Bytes(row.try_get(place)?)),
-            // Of a function that only does something.
-            "VOID" => Ok(Value::Integer(None)),
-            other => Err(Error::Corrupt(format!("a column of the type {other}"))),
-        }
-    };
-    let read = |row: &D::Row| {
-        Ok(Row::new(columns.clone(), (0..row.len()).map(|place| cell(row, place)).collect::<Result<_, Error>>()?))
-    };
-    rows.iter().map(read).collect()
 }
 
 /// A row of an answer, read by the names of its columns.

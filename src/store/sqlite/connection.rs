@@ -1,7 +1,4 @@
-//! The connection that writes: SQLite called on the writer's own thread.
-//!
-//! sqlx keeps a thread for each connection, and every statement is a message to it and an answer back. Beside busy
-//! solvers that is most of what a small job costs: a wake-up takes longer than a statement.
+//! A connection to the database, called on whatever thread has it.
 
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
@@ -23,33 +20,68 @@ const SPILL_PAGES: i64 = 16_384;
 const PREPARED: usize = 128;
 
 /// A connection of rusqlite.
-pub(in crate::store) struct WriteConnection {
+#[derive(Debug)]
+pub(in crate::store) struct SqliteConnection {
     inner: rusqlite::Connection,
     database: PathBuf,
 }
 
-impl WriteConnection {
-    /// Opens a database that is there.
+impl SqliteConnection {
+    /// Opens a database that is there, to write.
     ///
     /// # Errors
     /// [`Error::Unavailable`], [`Error::NoSpace`] and [`Error::Corrupt`].
     pub(super) fn open(database: &Path) -> Result<Self, Error> {
+        let connection = Self::connect(database, OpenFlags::empty())?;
+        // Up to so many pages, each is in the log once, not each time that the cache is full; and not at all where the
+        // transaction gives it back, as on a full disk it must.
+        connection.inner.pragma_update(None, "cache_spill", SPILL_PAGES)?;
+        // Only with the first look does it open the log, and keep others that close from being the last to go.
+        connection.inner.query_row("PRAGMA schema_version", [], |_| Ok(()))?;
+        Ok(connection)
+    }
+
+    /// Opens one that is there, to read.
+    ///
+    /// # Errors
+    /// As [`SqliteConnection::open`].
+    pub(super) fn open_to_read(database: &Path) -> Result<Self, Error> {
+        let connection = Self::connect(database, OpenFlags::empty())?;
+        connection.inner.pragma_update(None, "query_only", "ON")?;
+        Ok(connection)
+    }
+
+    /// Makes one that gives back the space of what is removed.
+    ///
+    /// # Errors
+    /// As [`SqliteConnection::open`].
+    pub(super) fn create(database: &Path) -> Result<Self, Error> {
+        let connection = Self::connect(database, OpenFlags::SQLITE_OPEN_CREATE)?;
+        // Only takes effect in a new file, and is a write in any other.
+        connection.inner.pragma_update(None, "auto_vacuum", "INCREMENTAL")?;
+        Ok(connection)
+    }
+
+    fn connect(database: &Path, more: OpenFlags) -> Result<Self, Error> {
         // One thread at a time has it: SQLite need not lock.
-        let flags = OpenFlags::SQLITE_OPEN_READ_WRITE | OpenFlags::SQLITE_OPEN_NO_MUTEX;
+        let flags = OpenFlags::SQLITE_OPEN_READ_WRITE | OpenFlags::SQLITE_OPEN_NO_MUTEX | more;
         let connection = rusqlite::Connection::open_with_flags(database, flags)?;
         connection.busy_timeout(BUSY_TIMEOUT)?;
         connection.set_prepared_statement_cache_capacity(PREPARED);
+        // Plans that do not depend on the values of parameters: with every other value of a `LIMIT` SQLite would
+        // prepare the statement anew.
+        connection.set_db_config(DbConfig::SQLITE_DBCONFIG_ENABLE_QPSG, true)?;
+        // Dropping this does not write the log back: see `close`.
+        connection.set_db_config(DbConfig::SQLITE_DBCONFIG_NO_CKPT_ON_CLOSE, true)?;
         for (name, value) in SETTINGS {
             connection.pragma_update(None, name, value)?;
         }
-        // Up to so many pages, each is in the log once, not each time that the cache is full; and not at all where the
-        // transaction gives it back, as on a full disk it must.
-        connection.pragma_update(None, "cache_spill", SPILL_PAGES)?;
-        // Dropping this does not write the log back: see `close`.
-        connection.set_db_config(DbConfig::SQLITE_DBCONFIG_NO_CKPT_ON_CLOSE, true)?;
-        // Only with the first look does it open the log, and keep others that close from being the last to go.
-        connection.query_row("PRAGMA schema_version", [], |_| Ok(()))?;
         Ok(Self { inner: connection, database: database.to_owned() })
+    }
+
+    /// Has commits go to a log beside the file first, from here on: readers then wait for no writer.
+    pub(super) fn write_ahead(&mut self) -> Result<(), Error> {
+        Ok(self.inner.pragma_update(None, "journal_mode", "WAL")?)
     }
 
     /// Runs one without parameters or rows.
@@ -89,7 +121,6 @@ impl WriteConnection {
         self.inner.total_changes()
     }
 
-    #[cfg(test)]
     pub(super) fn inner(&mut self) -> &mut rusqlite::Connection {
         &mut self.inner
     }
@@ -100,11 +131,12 @@ impl WriteConnection {
         let connection = rusqlite::Connection::open_in_memory()?;
         connection.set_prepared_statement_cache_capacity(PREPARED);
         connection.pragma_update(None, "foreign_keys", "ON")?;
-        connection.execute_batch(super::SCHEMA)?;
+        connection.execute_batch(super::schema::SCHEMA)?;
         Ok(Self { inner: connection, database: PathBuf::new() })
     }
 
-    fn run(&mut self, statement: &Statement) -> Result<Vec<Row>, Error> {
+    /// Runs a statement to its end and returns its rows.
+    pub(super) fn run(&mut self, statement: &Statement) -> Result<Vec<Row>, Error> {
         let mut prepared = self.inner.prepare_cached(statement.sql())?;
         bind(&mut prepared, statement.values())?;
         let columns: Arc<[String]> = prepared.column_names().into_iter().map(str::to_owned).collect();
@@ -144,7 +176,7 @@ fn bind(prepared: &mut Prepared<'_>, values: &[Value]) -> Result<(), Error> {
 }
 
 #[async_trait::async_trait]
-impl Connection for WriteConnection {
+impl Connection for SqliteConnection {
     async fn rows(&mut self, statement: Statement) -> Result<Vec<Row>, Error> {
         self.run(&statement)
     }

@@ -17,9 +17,9 @@ fn value(count: &Count) -> usize {
 }
 
 /// An operation that writes nothing and counts how often it was run.
-fn counting(runs: &Count) -> Operation<WriteConnection, ()> {
+fn counting(runs: &Count) -> Operation<SqliteConnection, ()> {
     let runs = runs.clone();
-    sql::operation(move |_: &mut WriteConnection| {
+    sql::operation(move |_: &mut SqliteConnection| {
         runs.fetch_add(1, Ordering::SeqCst);
         async { Ok(()) }.boxed()
     })
@@ -29,7 +29,7 @@ fn counting(runs: &Count) -> Operation<WriteConnection, ()> {
 async fn commits(store: &Sqlite) -> Count {
     let commits = Count::default();
     let counted = commits.clone();
-    let hook = sql::operation(move |connection: &mut WriteConnection| {
+    let hook = sql::operation(move |connection: &mut SqliteConnection| {
         let counted = counted.clone();
         async move {
             // `false`: not to be rolled back.
@@ -138,8 +138,8 @@ async fn what_is_large_is_committed_by_itself_and_costs_the_others_nothing() {
 #[tokio::test]
 async fn an_operation_that_panics_costs_only_itself() {
     let fixture = Fixture::open().await.expect("opens");
-    let called = sql::operation(|_: &mut WriteConnection| panic!("in the call"));
-    let awaited = sql::operation(|_: &mut WriteConnection| async { panic!("in what it awaits") }.boxed());
+    let called = sql::operation(|_: &mut SqliteConnection| panic!("in the call"));
+    let awaited = sql::operation(|_: &mut SqliteConnection| async { panic!("in what it awaits") }.boxed());
     for operation in [called, awaited] {
         let outcome: Result<(), Error> = fixture.writer.write(WriteIntent::Little, operation).await;
         assert!(matches!(outcome, Err(Error::Corrupt(_))), "{outcome:?}");

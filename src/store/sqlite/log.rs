@@ -9,7 +9,7 @@ use std::path::Path;
 use std::time::Duration;
 
 use super::BUSY_TIMEOUT;
-use super::connection::WriteConnection;
+use super::connection::SqliteConnection;
 use crate::store::Error;
 
 /// Pages at which the log is written back, as SQLite has it: 4 MB.
@@ -34,7 +34,7 @@ pub(super) enum Log {
     Lacks(u64),
 }
 
-impl WriteConnection {
+impl SqliteConnection {
     /// Writes a log of so many pages at least back into the database. Outside a transaction, as all of this.
     pub(super) fn write_log_back(&mut self, least_pages: i64) -> Result<Log, Error> {
         let (pages, written): (i64, i64) = self.first_row(LOOK, |row| Ok((row.get(1)?, row.get(2)?)))?;

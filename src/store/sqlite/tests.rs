@@ -5,6 +5,7 @@ use tempfile::TempDir;
 use tokio::sync::{oneshot, watch};
 use tokio::task::JoinHandle;
 
+use super::sql::{Row, Statement};
 use super::*;
 use crate::domain::job::JobState;
 use crate::store::{Claim, contract};
@@ -18,13 +19,13 @@ pub(super) struct Fixture {
 impl Fixture {
     pub async fn open() -> Option<Self> {
         let directory = tempfile::tempdir().expect("a temporary directory");
-        Some(Self { store: Sqlite::open(directory.path()).await.expect("opens"), _directory: directory })
+        Some(Self { store: Sqlite::open(directory.path()).expect("opens"), _directory: directory })
     }
 
     /// One whose groups take all that waits, however long that takes.
     pub async fn open_patient() -> Self {
         let directory = tempfile::tempdir().expect("a temporary directory");
-        let store = Sqlite::open_with(directory.path(), Duration::MAX).await.expect("opens");
+        let store = Sqlite::open_with(directory.path(), Duration::MAX).expect("opens");
         Self { store, _directory: directory }
     }
 }
@@ -40,7 +41,7 @@ impl std::ops::Deref for Fixture {
 impl Sqlite {
     /// Runs statements as they are on the writer's connection, for tests that need the database to misbehave.
     pub(crate) async fn execute(&self, statements: &'static str) {
-        let run = sql::operation(move |connection: &mut WriteConnection| {
+        let run = sql::operation(move |connection: &mut SqliteConnection| {
             Box::pin(async move { Ok(connection.inner().execute_batch(statements)?) })
         });
         self.writer.write(WriteIntent::Little, run).await.expect("valid statements");
@@ -60,7 +61,7 @@ impl Sqlite {
         let (go, gone) = watch::channel(());
         let (tell, begun) = oneshot::channel();
         let tell = std::sync::Mutex::new(Some(tell));
-        let wait = sql::operation(move |_: &mut WriteConnection| {
+        let wait = sql::operation(move |_: &mut SqliteConnection| {
             let mut gone = gone.clone();
             if let Some(tell) = tell.lock().expect("no panic").take() {
                 tell.send(()).expect("somebody waits");
@@ -81,7 +82,7 @@ impl Sqlite {
     /// What a pragma says on the connection that writes.
     async fn on_writer<T: Send + 'static>(&self, pragma: &'static str, read: fn(&Row) -> Result<T, Error>) -> T {
         let (tell, told) = std::sync::mpsc::channel();
-        let run = sql::operation(move |connection: &mut WriteConnection| {
+        let run = sql::operation(move |connection: &mut SqliteConnection| {
             let tell = tell.clone();
             async move {
                 let rows = connection.rows(Statement::new(pragma)).await?;
@@ -100,31 +101,55 @@ contract::store_contract!(Fixture::open);
 #[tokio::test]
 async fn a_second_server_on_the_directory_is_refused_until_the_first_is_gone() {
     let directory = tempfile::tempdir().expect("a temporary directory");
-    let first = Sqlite::open(directory.path()).await.expect("opens");
-    let error = Sqlite::open(directory.path()).await.expect_err("is held");
+    let first = Sqlite::open(directory.path()).expect("opens");
+    let error = Sqlite::open(directory.path()).expect_err("is held");
     assert_eq!(error, Error::InUse(directory.path().to_path_buf()));
     assert!(error.to_string().contains("in use by another server"), "{error}");
     drop(first);
-    Sqlite::open(directory.path()).await.expect("the first let go");
+    Sqlite::open(directory.path()).expect("the first let go");
 }
 
 #[tokio::test]
 async fn everything_is_there_after_a_reopen_and_every_lease_is_a_dead_one() {
     let directory = tempfile::tempdir().expect("a temporary directory");
     let now = contract::time(1);
-    let store = Sqlite::open(directory.path()).await.expect("opens");
+    let store = Sqlite::open(directory.path()).expect("opens");
     store.create_job(contract::record("a"), &contract::ROOM, now).await.expect("created");
     let claimed =
         store.claim(&Claim::one("w", Duration::from_secs(3600)), now).await.expect("claims").begun.expect("a job");
     let events = store.events_after(&claimed.job.name, 0, 10).await.expect("events");
     drop(store);
 
-    let store = Sqlite::open(directory.path()).await.expect("opens again");
+    let store = Sqlite::open(directory.path()).expect("opens again");
     assert_eq!(store.job(&claimed.job.name).await.expect("kept"), claimed.job);
     assert_eq!(store.events_after(&claimed.job.name, 0, 10).await.expect("kept"), events);
     let recovered = store.recover(now, 3).await.expect("recovers");
     assert_eq!(recovered.len(), 1, "though the lease has an hour to go");
     assert_eq!(recovered[0].state, JobState::Queued);
+}
+
+#[tokio::test]
+async fn a_read_that_is_given_up_leaves_its_connection_to_others() {
+    let fixture = Fixture::open().await.expect("opens");
+    let created = fixture.create_job(contract::record("a"), &contract::ROOM, contract::time(0)).await.expect("created");
+    let name = created.job.name;
+    for number in 0..20 {
+        // Off this thread: it has begun, or waits for a connection.
+        assert!(fixture.result(&name).now_or_never().is_none(), "read {number}");
+    }
+    assert_eq!(fixture.result(&name).await, Ok(None));
+    fixture.job(&name).await.expect("is there");
+}
+
+#[tokio::test]
+async fn a_closed_store_says_so() {
+    let fixture = Fixture::open().await.expect("opens");
+    fixture.queue_stats().await.expect("open");
+    fixture.close().await;
+    let closed = Error::Unavailable("the store is closed".into());
+    assert_eq!(fixture.queue_stats().await, Err(closed.clone()));
+    let created = fixture.create_job(contract::record("a"), &contract::ROOM, contract::time(0)).await;
+    assert_eq!(created.map(|created| created.job.name), Err(closed));
 }
 
 #[tokio::test]
@@ -134,11 +159,11 @@ async fn a_database_of_another_version_is_refused() {
     let older = "UPDATE _sqlx_migrations SET checksum = x'00'";
     for (statement, step) in [(newer, "step 9999"), (older, "step 1")] {
         let directory = tempfile::tempdir().expect("a temporary directory");
-        let store = Sqlite::open(directory.path()).await.expect("opens");
+        let store = Sqlite::open(directory.path()).expect("opens");
         store.execute(statement).await;
         store.close().await;
         drop(store);
-        let error = Sqlite::open(directory.path()).await.expect_err("is of another version");
+        let error = Sqlite::open(directory.path()).expect_err("is of another version");
         assert!(matches!(&error, Error::Corrupt(told) if told.contains(step)), "{error}");
     }
 }
@@ -151,7 +176,7 @@ async fn a_database_of_another_program_is_refused_and_left_as_it_is() {
         let database = directory.path().join(DATABASE_FILE);
         rusqlite::Connection::open(&database).and_then(|made| made.execute_batch(schema)).expect("made");
         let before = std::fs::read(&database).expect("is there");
-        let error = Sqlite::open(directory.path()).await.expect_err("is foreign");
+        let error = Sqlite::open(directory.path()).expect_err("is foreign");
         assert!(matches!(&error, Error::Corrupt(told) if told.contains("of another program")), "{error}");
         assert_eq!(std::fs::read(&database).expect("is there"), before);
         assert_eq!(files(directory.path()), [DATABASE_FILE, LOCK_FILE]);
@@ -173,7 +198,7 @@ async fn a_file_that_is_no_database_is_refused_by_its_name_and_left_as_it_is() {
     let database = directory.path().join(DATABASE_FILE);
     let text = "No database, and longer than the header of one. ".repeat(100);
     std::fs::write(&database, &text).expect("written");
-    let error = Sqlite::open(directory.path()).await.expect_err("no database");
+    let error = Sqlite::open(directory.path()).expect_err("no database");
     let path = database.display().to_string();
     let says = |told: &str| told.starts_with(&path) && told.contains("not a database") && told.contains("data_dir");
     assert!(matches!(&error, Error::Corrupt(told) if says(told)), "{error}");
@@ -195,19 +220,19 @@ async fn an_empty_file_is_refused_and_half_a_start_is_none() {
     let directory = tempfile::tempdir().expect("a temporary directory");
     // What a start leaves that is cut off.
     std::fs::write(directory.path().join(DRAFT_FILE), b"half").expect("written");
-    let store = Sqlite::open(directory.path()).await.expect("opens");
+    let store = Sqlite::open(directory.path()).expect("opens");
     store.create_job(contract::record("a"), &contract::ROOM, contract::time(0)).await.expect("created");
     store.close().await;
     drop(store);
     let database = directory.path().join(DATABASE_FILE);
     std::fs::write(&database, b"").expect("emptied");
-    let error = Sqlite::open(directory.path()).await.expect_err("its jobs are gone");
+    let error = Sqlite::open(directory.path()).expect_err("its jobs are gone");
     assert!(matches!(&error, Error::Corrupt(text) if text.contains("has no bytes")), "{error}");
     assert_eq!(std::fs::metadata(&database).expect("is there").len(), 0, "left as it was found");
     let log = directory.path().join(format!("{DATABASE_FILE}-wal"));
     std::fs::remove_file(&database).expect("removed");
     std::fs::write(&log, b"commits").expect("written");
-    let error = Sqlite::open(directory.path()).await.expect_err("the log is all that is left");
+    let error = Sqlite::open(directory.path()).expect_err("the log is all that is left");
     assert!(matches!(&error, Error::Corrupt(text) if text.contains("is missing beside its log")), "{error}");
     assert_eq!(std::fs::read(&log).expect("is there"), b"commits", "left as it was found");
 }
@@ -262,7 +287,7 @@ async fn of_a_deleted_input_nothing_is_left_once_its_jobs_are_gone() {
 #[tokio::test]
 async fn a_write_that_finds_no_room_is_run_again_once_the_log_is_cut() {
     let directory = tempfile::tempdir().expect("a temporary directory");
-    let store = Sqlite::open(directory.path()).await.expect("a store");
+    let store = Sqlite::open(directory.path()).expect("a store");
     // A log that is too short to be written back by itself.
     let new = crate::store::NewRecord { input: vec![7; 3 << 20].into(), ..contract::record("a") };
     let name = store.create_job(new, &contract::ROOM, contract::time(0)).await.expect("created").job.name;

@@ -1,7 +1,7 @@
 //! Giving the space of what was removed back to the disk: pages at a time, and only where that gives more than it
 //! takes.
 
-use super::connection::WriteConnection;
+use super::connection::SqliteConnection;
 use crate::store::Error;
 
 /// Pages that are handed back at a time: writers wait meanwhile.
@@ -48,7 +48,7 @@ impl Pages {
     }
 }
 
-impl WriteConnection {
+impl SqliteConnection {
     /// Whether [`VACUUM`] is worth it, where so many bytes of the disk are kept for a time like this.
     pub(super) fn vacuum_pays(&mut self, kept: u64) -> Result<bool, Error> {
         let page = self.page_bytes()?;

@@ -15,7 +15,7 @@ use tokio::time::{Instant, sleep};
 
 use crate::store::clock::LeaseClock;
 use crate::store::sql::{Connection, Database, Operation, Row, Size, Statement, WriteIntent, micros};
-use crate::store::sqlite::WriteConnection;
+use crate::store::sqlite::SqliteConnection;
 use crate::store::{Clock, Error, Notification, Store};
 
 /// Notifications that a server may be behind before it is told that some are lost.
@@ -86,7 +86,7 @@ pub(crate) struct Cluster {
 impl Cluster {
     /// An empty database.
     pub(crate) fn new(bug: Option<Bug>) -> Self {
-        let inner = WriteConnection::in_memory().expect("a database in memory");
+        let inner = SqliteConnection::in_memory().expect("a database in memory");
         let connection = SimulatedConnection { inner, committing: Vec::new(), bug, reads: 0 };
         Self {
             connection: Arc::new(tokio::sync::Mutex::new(connection)),
@@ -280,7 +280,7 @@ impl Connection for ReadConnection {
 
 /// The connection that all servers share.
 pub(crate) struct SimulatedConnection {
-    inner: WriteConnection,
+    inner: SqliteConnection,
     /// Sent to the others once the transaction is committed.
     committing: Vec<Notification>,
     bug: Option<Bug>,

@@ -392,7 +392,7 @@ async fn what_a_later_version_put_into_a_result_is_sent_by_this_one() {
         [convert::result::encode(name, solution), Later { later: 7 }.encode_to_vec()].concat()
     }
     let directory = tempfile::tempdir().expect("a temporary directory");
-    let store = Arc::new(Sqlite::open(directory.path()).await.expect("a store"));
+    let store = Arc::new(Sqlite::open(directory.path()).expect("a store"));
     let engine = Engine::start(one_worker(), store, quick(), encode).await.expect("an engine");
     let server = Server::bind(Options::default(), engine).await.expect("a server");
     let channel = Channel::from_shared(format!("http://{}", server.address())).expect("a URL").connect().await;

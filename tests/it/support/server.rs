@@ -79,7 +79,7 @@ pub fn one_worker() -> engine::Options {
 }
 
 async fn serve(directory: &Path, solver: Solver, options: Options, engine: engine::Options) -> (Server, Engine) {
-    let store = Sqlite::open(directory).await.expect("a store");
+    let store = Sqlite::open(directory).expect("a store");
     let engine = Engine::start(engine, Arc::new(store), solver, encode_result).await.expect("an engine");
     let server = Server::bind(options, engine.clone()).await.expect("a server");
     (server, engine)

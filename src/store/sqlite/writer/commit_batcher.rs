@@ -10,7 +10,7 @@ use super::pending::Pending;
 use crate::store::Error;
 use crate::store::sql::WriteIntent;
 use crate::store::sqlite::ballast::{BALLAST_BYTES, Ballast, RETRY};
-use crate::store::sqlite::connection::WriteConnection;
+use crate::store::sqlite::connection::SqliteConnection;
 use crate::store::sqlite::log::{LONG_PAGES, Log};
 use crate::store::sqlite::vacuum::VACUUM_BYTES;
 use crate::telemetry::metrics;
@@ -21,7 +21,7 @@ const BEGIN: &str = "BEGIN IMMEDIATE";
 /// What the thread has.
 pub(super) struct CommitBatcher {
     /// `None`: the last one was of no more use.
-    connection: Option<WriteConnection>,
+    connection: Option<SqliteConnection>,
     database: PathBuf,
     ballast: Ballast,
     /// When the ballast was last given up so that the log could be cut. For a while that is not tried again: it may
@@ -37,7 +37,7 @@ type Executed = (Pending, Result<(), Error>);
 
 impl CommitBatcher {
     pub(super) fn new(
-        connection: WriteConnection,
+        connection: SqliteConnection,
         database: PathBuf,
         ballast: Ballast,
         messages: mpsc::UnboundedReceiver<Message>,
@@ -66,7 +66,7 @@ impl CommitBatcher {
                     None
                 }
                 Message::Close(done) => {
-                    if let Some(Err(error)) = self.connection.take().map(WriteConnection::close) {
+                    if let Some(Err(error)) = self.connection.take().map(SqliteConnection::close) {
                         tracing::debug!(%error, "the log is left to the next start");
                     }
                     let _ = done.send(());
@@ -209,7 +209,7 @@ impl CommitBatcher {
 
     /// Where it cannot be cut, nothing is lost: it is tried again.
     fn cut_log(&mut self) {
-        if let Err(error) = self.connection().and_then(WriteConnection::cut_log) {
+        if let Err(error) = self.connection().and_then(SqliteConnection::cut_log) {
             tracing::debug!(%error, "the log cannot be cut");
         }
     }
@@ -241,7 +241,7 @@ impl CommitBatcher {
     /// Writes the log back, however short it is, where the file is longer than its pages by what one
     /// [`VACUUM`](crate::store::sqlite::vacuum::VACUUM) gives back at least.
     fn shorten(&mut self) {
-        match self.connection().and_then(WriteConnection::surplus) {
+        match self.connection().and_then(SqliteConnection::surplus) {
             Ok(bytes) if bytes > VACUUM_BYTES => self.write_log_back(1),
             Ok(_) => {}
             Err(error) => tracing::debug!(%error, "the database cannot be shortened"),
@@ -279,10 +279,10 @@ impl CommitBatcher {
         self.connection()?.control(statement)
     }
 
-    fn connection(&mut self) -> Result<&mut WriteConnection, Error> {
+    fn connection(&mut self) -> Result<&mut SqliteConnection, Error> {
         let connection = match self.connection.take() {
             Some(connection) => connection,
-            None => WriteConnection::open(&self.database)?,
+            None => SqliteConnection::open(&self.database)?,
         };
         Ok(self.connection.insert(connection))
     }

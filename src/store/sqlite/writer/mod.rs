@@ -19,7 +19,8 @@ use tokio::time::timeout;
 use self::commit_batcher::CommitBatcher;
 use self::pending::Pending;
 use super::ballast::Ballast;
-use super::connection::WriteConnection;
+use super::closed;
+use super::connection::SqliteConnection;
 use crate::store::Error;
 use crate::store::sql::{self, Connection, Operation, Statement, WriteIntent};
 
@@ -57,7 +58,7 @@ impl Writer {
     /// # Errors
     /// [`Error::Unavailable`] where the system has no thread to give.
     pub(super) fn start(
-        connection: WriteConnection,
+        connection: SqliteConnection,
         database: PathBuf,
         ballast: Ballast,
         group_time: Duration,
@@ -77,7 +78,7 @@ impl Writer {
     pub(super) async fn write(
         &self,
         intent: WriteIntent,
-        operation: Operation<WriteConnection, ()>,
+        operation: Operation<SqliteConnection, ()>,
     ) -> Result<(), Error> {
         let (pending, turn, mut answer) = Pending::new(intent, operation);
         self.inbox.send(Message::Write(pending)).map_err(|_| closed())?;
@@ -95,7 +96,7 @@ impl Writer {
 
     /// Runs one statement without parameters.
     pub(super) async fn run(&self, intent: WriteIntent, statement: &'static str) -> Result<(), Error> {
-        let run = sql::operation(move |connection: &mut WriteConnection| {
+        let run = sql::operation(move |connection: &mut SqliteConnection| {
             async move { connection.rows(Statement::new(statement)).await.map(drop) }.boxed()
         });
         self.write(intent, run).await
@@ -132,10 +133,6 @@ impl Writer {
         self.inbox.send(message(done)).map_err(|_| closed())?;
         answer.await.map_err(|_| closed())
     }
-}
-
-fn closed() -> Error {
-    Error::Unavailable("the store is closed".into())
 }
 
 fn no_turn(turn_timeout: Duration) -> Error {

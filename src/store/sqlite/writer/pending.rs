@@ -7,7 +7,7 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use futures_util::FutureExt;
 use tokio::sync::oneshot;
 
-use super::{LARGE_BYTES, WriteConnection};
+use super::{LARGE_BYTES, SqliteConnection};
 use crate::store::Error;
 use crate::store::sql::{Operation, WriteIntent};
 
@@ -24,7 +24,7 @@ impl BeginFlag {
 
 /// An operation that waits for its turn.
 pub(super) struct Pending {
-    operation: Operation<WriteConnection, ()>,
+    operation: Operation<SqliteConnection, ()>,
     pub(super) intent: WriteIntent,
     begin: Arc<BeginFlag>,
     reply: oneshot::Sender<Result<(), Error>>,
@@ -34,7 +34,7 @@ impl Pending {
     /// With the flag by which its caller may give it up, and where its answer comes.
     pub(super) fn new(
         intent: WriteIntent,
-        operation: Operation<WriteConnection, ()>,
+        operation: Operation<SqliteConnection, ()>,
     ) -> (Self, Arc<BeginFlag>, oneshot::Receiver<Result<(), Error>>) {
         let begin = Arc::new(BeginFlag::default());
         let (reply, answer) = oneshot::channel();
@@ -52,7 +52,7 @@ impl Pending {
     }
 
     /// Runs it within the transaction. It may be run again where the transaction came to nothing.
-    pub(super) async fn run(&self, connection: &mut WriteConnection) -> Result<(), Error> {
+    pub(super) async fn run(&self, connection: &mut SqliteConnection) -> Result<(), Error> {
         // A defect in one operation must not cost the others their writer, be it in its call or in what it awaits.
         let run = async { (self.operation)(connection).await };
         let outcome = AssertUnwindSafe(run).catch_unwind().await;
