@@ -56,44 +56,22 @@ impl fmt::Display for JobName {
     }
 }
 
-/// Where a job stands.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Serialize, Deserialize)]
-#[serde(rename_all = "SCREAMING_SNAKE_CASE")]
-pub enum JobState {
-    /// Stored, waiting for a worker.
-    Queued,
-    /// A worker holds the lease.
-    Running,
-    Succeeded,
-    Failed,
-    Cancelled,
-    /// The deadline passed before a result stood.
-    DeadlineExceeded,
+scpsfm_core::named! {
+    /// Where a job stands.
+    pub enum JobState {
+        /// Stored, waiting for a worker.
+        Queued = "QUEUED",
+        /// A worker holds the lease.
+        Running = "RUNNING",
+        Succeeded = "SUCCEEDED",
+        Failed = "FAILED",
+        Cancelled = "CANCELLED",
+        /// The deadline passed before a result stood.
+        DeadlineExceeded = "DEADLINE_EXCEEDED",
+    }
 }
 
 impl JobState {
-    /// Every state.
-    pub const ALL: [JobState; 6] = [
-        JobState::Queued,
-        JobState::Running,
-        JobState::Succeeded,
-        JobState::Failed,
-        JobState::Cancelled,
-        JobState::DeadlineExceeded,
-    ];
-
-    /// The state's name in files, metrics, filters and the store.
-    pub fn name(self) -> &'static str {
-        match self {
-            JobState::Queued => "QUEUED",
-            JobState::Running => "RUNNING",
-            JobState::Succeeded => "SUCCEEDED",
-            JobState::Failed => "FAILED",
-            JobState::Cancelled => "CANCELLED",
-            JobState::DeadlineExceeded => "DEADLINE_EXCEEDED",
-        }
-    }
-
     /// The state of that name.
     pub fn from_name(name: &str) -> Option<Self> {
         Self::ALL.into_iter().find(|state| state.name() == name)
@@ -187,31 +165,19 @@ pub struct PastAttempt {
     pub end: AttemptEnd,
 }
 
-/// How an attempt ended.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
-#[serde(rename_all = "SCREAMING_SNAKE_CASE")]
-pub enum AttemptEnd {
-    /// It ended its job.
-    Ended,
-    /// Its server gave the job back, as at a drain.
-    GivenBack,
-    /// Its server was not heard of for the time of a lease, or its process died.
-    Lost,
+scpsfm_core::named! {
+    /// How an attempt ended.
+    pub enum AttemptEnd {
+        /// It ended its job.
+        Ended = "ENDED",
+        /// Its server gave the job back, as at a drain.
+        GivenBack = "GIVEN_BACK",
+        /// Its server was not heard of for the time of a lease, or its process died.
+        Lost = "LOST",
+    }
 }
 
 impl AttemptEnd {
-    /// Every end.
-    pub const ALL: [AttemptEnd; 3] = [AttemptEnd::Ended, AttemptEnd::GivenBack, AttemptEnd::Lost];
-
-    /// The end's name in the store and in answers.
-    pub fn name(self) -> &'static str {
-        match self {
-            AttemptEnd::Ended => "ENDED",
-            AttemptEnd::GivenBack => "GIVEN_BACK",
-            AttemptEnd::Lost => "LOST",
-        }
-    }
-
     /// The end of that name.
     pub fn from_name(name: &str) -> Option<Self> {
         Self::ALL.into_iter().find(|end| end.name() == name)

@@ -3,27 +3,28 @@
 
 use std::fmt;
 
-/// Something that a server has only so much room for.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum Quota {
-    /// Jobs that wait.
-    Jobs,
-    /// Bytes of inputs, as they are stored, of jobs that wait.
-    Bytes,
-    /// Observations of jobs that wait.
-    Observations,
-    /// Jobs of one tenant that wait.
-    TenantJobs,
-    /// Bytes of inputs of one tenant's jobs that wait.
-    TenantBytes,
-    /// Bytes of one upload.
-    UploadBytes,
-    /// One tenant's uploads that are begun and not finished.
-    TenantUploads,
-    /// Bytes of those and of the tenant's uploaded inputs.
-    TenantUploadBytes,
-    /// Bytes of memory of the jobs that one server solves at once.
-    SolverBytes,
+scpsfm_core::named! {
+    /// Something that a server has only so much room for.
+    pub enum Quota {
+        /// Jobs that wait.
+        Jobs = "jobs",
+        /// Bytes of inputs, as they are stored, of jobs that wait.
+        Bytes = "bytes",
+        /// Observations of jobs that wait.
+        Observations = "observations",
+        /// Jobs of one tenant that wait.
+        TenantJobs = "tenant_jobs",
+        /// Bytes of inputs of one tenant's jobs that wait.
+        TenantBytes = "tenant_bytes",
+        /// Bytes of one upload.
+        UploadBytes = "upload_bytes",
+        /// One tenant's uploads that are begun and not finished.
+        TenantUploads = "tenant_uploads",
+        /// Bytes of those and of the tenant's uploaded inputs.
+        TenantUploadBytes = "tenant_upload_bytes",
+        /// Bytes of memory of the jobs that one server solves at once.
+        SolverBytes = "solver_bytes",
+    }
 }
 
 impl Quota {
@@ -33,21 +34,6 @@ impl Quota {
 
     /// Those of uploads.
     pub const OF_UPLOADS: [Quota; 3] = [Quota::UploadBytes, Quota::TenantUploads, Quota::TenantUploadBytes];
-
-    /// The bound's name in metrics and error details.
-    pub fn name(self) -> &'static str {
-        match self {
-            Quota::Jobs => "jobs",
-            Quota::Bytes => "bytes",
-            Quota::Observations => "observations",
-            Quota::TenantJobs => "tenant_jobs",
-            Quota::TenantBytes => "tenant_bytes",
-            Quota::UploadBytes => "upload_bytes",
-            Quota::TenantUploads => "tenant_uploads",
-            Quota::TenantUploadBytes => "tenant_upload_bytes",
-            Quota::SolverBytes => "solver_bytes",
-        }
-    }
 
     /// The key of the server's configuration that sets it.
     pub fn key(self) -> &'static str {

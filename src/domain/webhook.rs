@@ -16,29 +16,15 @@ pub struct Webhook {
     pub last_error: Option<String>,
 }
 
-/// How far a delivery has come.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
-#[serde(rename_all = "SCREAMING_SNAKE_CASE")]
-pub enum WebhookState {
-    /// The job has not ended, or the receiver has not accepted its end yet.
-    Pending,
-    /// The receiver has accepted it.
-    Delivered,
-    /// No further attempt is made.
-    GivenUp,
-}
-
-impl WebhookState {
-    /// Every state.
-    pub const ALL: [WebhookState; 3] = [WebhookState::Pending, WebhookState::Delivered, WebhookState::GivenUp];
-
-    /// The state's name in answers.
-    pub fn name(self) -> &'static str {
-        match self {
-            WebhookState::Pending => "PENDING",
-            WebhookState::Delivered => "DELIVERED",
-            WebhookState::GivenUp => "GIVEN_UP",
-        }
+scpsfm_core::named! {
+    /// How far a delivery has come.
+    pub enum WebhookState {
+        /// The job has not ended, or the receiver has not accepted its end yet.
+        Pending = "PENDING",
+        /// The receiver has accepted it.
+        Delivered = "DELIVERED",
+        /// No further attempt is made.
+        GivenUp = "GIVEN_UP",
     }
 }
 

@@ -137,7 +137,7 @@ pub fn status_of(refusal: HttpRefusal, text: impl Into<String>) -> Status {
         HttpRefusal::TooLarge => Code::OutOfRange,
         _ => Code::InvalidArgument,
     };
-    status::refused(code, refusal.reason(), text)
+    status::refused(code, refusal.name(), text)
 }
 
 /// A refusal with this code of HTTP.

@@ -45,30 +45,20 @@ impl Hash {
     }
 }
 
-/// What a key allows. Each scope allows what those before it do.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
-pub enum Scope {
-    /// Calls that change nothing.
-    ReadOnly,
-    /// Every call on the tenant's own jobs and inputs.
-    Ordinary,
-    /// The administration, and every call on the jobs and inputs of all tenants.
-    Admin,
+scpsfm_core::named! {
+    /// What a key allows. Each scope allows what those before it do.
+    #[derive(PartialOrd, Ord)]
+    pub enum Scope {
+        /// Calls that change nothing.
+        ReadOnly = "read-only",
+        /// Every call on the tenant's own jobs and inputs.
+        Ordinary = "ordinary",
+        /// The administration, and every call on the jobs and inputs of all tenants.
+        Admin = "admin",
+    }
 }
 
 impl Scope {
-    /// Every scope.
-    pub const ALL: [Scope; 3] = [Scope::ReadOnly, Scope::Ordinary, Scope::Admin];
-
-    /// The scope's name in files of keys and in refusals.
-    pub fn name(self) -> &'static str {
-        match self {
-            Scope::ReadOnly => "read-only",
-            Scope::Ordinary => "ordinary",
-            Scope::Admin => "admin",
-        }
-    }
-
     fn from_name(name: &str) -> Option<Self> {
         Self::ALL.into_iter().find(|scope| scope.name() == name)
     }

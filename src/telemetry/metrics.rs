@@ -139,7 +139,7 @@ fn create_known_series() {
         counter!(UPLOAD_REFUSALS.name, "reason" => refusal.reason(), "bound" => refusal.bound()).absolute(0);
     }
     for refusal in HttpRefusal::ALL {
-        counter!(HTTP_REFUSED.name, "reason" => refusal.reason()).absolute(0);
+        counter!(HTTP_REFUSED.name, "reason" => refusal.name()).absolute(0);
     }
     for files in Reloaded::ALL {
         gauge!(RELOAD_FAILED.name, "files" => files.name()).set(0.0);
@@ -227,7 +227,7 @@ pub fn upload_refused(refusal: UploadRefusal) {
 
 /// A request over HTTP was refused before it became a call.
 pub fn http_refused(refusal: HttpRefusal) {
-    counter!(HTTP_REFUSED.name, "reason" => refusal.reason()).increment(1);
+    counter!(HTTP_REFUSED.name, "reason" => refusal.name()).increment(1);
 }
 
 /// Tells how many webhooks are to be delivered. As [`queue_depth`].

@@ -20,7 +20,7 @@ macro_rules! options {
     };
 }
 
-/// An enumeration, all of its values and the name of each, on the command line and in files, from one list.
+/// An enumeration, all of its values and the name of each, on the command line, in files and to callers, from one list.
 #[macro_export]
 macro_rules! named {
     (
@@ -36,8 +36,10 @@ macro_rules! named {
         }
 
         impl $kind {
+            /// Every value, in the order of the list.
             pub const ALL: [Self; [$($name),*].len()] = [$(Self::$value),*];
 
+            /// The value's name.
             pub fn name(self) -> &'static str {
                 match self {
                     $(Self::$value => $name,)*

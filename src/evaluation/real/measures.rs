@@ -36,21 +36,13 @@ pub struct Answer {
     pub warnings: Vec<String>,
 }
 
-/// What a side judges.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize)]
-#[serde(rename_all = "snake_case")]
-pub enum Verdicts {
-    #[default]
-    Observations,
-    Tracks,
-}
-
-impl Verdicts {
-    pub fn name(self) -> &'static str {
-        match self {
-            Verdicts::Observations => "observations",
-            Verdicts::Tracks => "tracks",
-        }
+scpsfm_core::named! {
+    /// What a side judges.
+    #[derive(Default)]
+    pub enum Verdicts {
+        #[default]
+        Observations = "observations",
+        Tracks = "tracks",
     }
 }
 

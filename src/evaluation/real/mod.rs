@@ -46,20 +46,11 @@ impl Error {
     }
 }
 
-/// Who answered.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
-#[serde(rename_all = "snake_case")]
-pub enum Side {
-    Scpsfm,
-    Peer,
-}
-
-impl Side {
-    pub fn name(self) -> &'static str {
-        match self {
-            Side::Scpsfm => "scpsfm",
-            Side::Peer => "peer",
-        }
+scpsfm_core::named! {
+    /// Who answered.
+    pub enum Side {
+        Scpsfm = "scpsfm",
+        Peer = "peer",
     }
 }
 

@@ -26,26 +26,17 @@ pub enum Refusal {
     RateLimited(RateBound),
 }
 
-/// What has a rate.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum RateBound {
-    /// Calls of a key.
-    Calls,
-    /// New jobs of a tenant.
-    Jobs,
+scpsfm_core::named! {
+    /// What has a rate.
+    pub enum RateBound {
+        /// Calls of a key.
+        Calls = "calls",
+        /// New jobs of a tenant.
+        Jobs = "jobs",
+    }
 }
 
 impl RateBound {
-    const ALL: [RateBound; 2] = [RateBound::Calls, RateBound::Jobs];
-
-    /// Its name to callers and in metrics.
-    pub fn name(self) -> &'static str {
-        match self {
-            RateBound::Calls => "calls",
-            RateBound::Jobs => "jobs",
-        }
-    }
-
     /// The key of the configuration that sets it.
     pub fn key(self) -> &'static str {
         match self {
@@ -124,100 +115,50 @@ impl UploadRefusal {
     }
 }
 
-/// Why a request over HTTP was refused before it became a call of the API. Requests that find no memory are counted
-/// by [`Refusal::Memory`].
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum HttpRefusal {
-    /// A page of another site sends it.
-    Origin,
-    /// It is for a host that the server does not know.
-    Host,
-    /// There is nothing at its path.
-    Path,
-    /// What is at its path is not for this method.
-    Method,
-    /// It has no key, or an unknown one.
-    Unauthenticated,
-    /// Its body is of another kind than JSON.
-    MediaType,
-    /// An upload that does not tell its length.
-    Length,
-    /// Its body is longer than it may be.
-    TooLarge,
-    /// Its body did not come in time.
-    Stalled,
-    /// Its JSON, its query or its path breaks a rule.
-    Invalid,
-}
-
-impl HttpRefusal {
-    pub(super) const ALL: [HttpRefusal; 10] = [
-        HttpRefusal::Origin,
-        HttpRefusal::Host,
-        HttpRefusal::Path,
-        HttpRefusal::Method,
-        HttpRefusal::Unauthenticated,
-        HttpRefusal::MediaType,
-        HttpRefusal::Length,
-        HttpRefusal::TooLarge,
-        HttpRefusal::Stalled,
-        HttpRefusal::Invalid,
-    ];
-
-    /// The label, and the reason that its caller is told but for keys, which have two.
-    pub fn reason(self) -> &'static str {
-        match self {
-            HttpRefusal::Origin => "ORIGIN_REFUSED",
-            HttpRefusal::Host => "HOST_REFUSED",
-            HttpRefusal::Path => "PATH_NOT_FOUND",
-            HttpRefusal::Method => "METHOD_NOT_ALLOWED",
-            HttpRefusal::Unauthenticated => "UNAUTHENTICATED",
-            HttpRefusal::MediaType => "UNSUPPORTED_MEDIA_TYPE",
-            HttpRefusal::Length => "LENGTH_REQUIRED",
-            HttpRefusal::TooLarge => "MESSAGE_TOO_LARGE",
-            HttpRefusal::Stalled => "INPUT_STALLED",
-            HttpRefusal::Invalid => "INVALID_ARGUMENT",
-        }
+scpsfm_core::named! {
+    /// Why a request over HTTP was refused before it became a call of the API. Requests that find no memory are counted
+    /// by [`Refusal::Memory`].
+    pub enum HttpRefusal {
+        /// A page of another site sends it.
+        Origin = "ORIGIN_REFUSED",
+        /// It is for a host that the server does not know.
+        Host = "HOST_REFUSED",
+        /// There is nothing at its path.
+        Path = "PATH_NOT_FOUND",
+        /// What is at its path is not for this method.
+        Method = "METHOD_NOT_ALLOWED",
+        /// It has no key, or an unknown one.
+        Unauthenticated = "UNAUTHENTICATED",
+        /// Its body is of another kind than JSON.
+        MediaType = "UNSUPPORTED_MEDIA_TYPE",
+        /// An upload that does not tell its length.
+        Length = "LENGTH_REQUIRED",
+        /// Its body is longer than it may be.
+        TooLarge = "MESSAGE_TOO_LARGE",
+        /// Its body did not come in time.
+        Stalled = "INPUT_STALLED",
+        /// Its JSON, its query or its path breaks a rule.
+        Invalid = "INVALID_ARGUMENT",
     }
 }
 
-/// Why a job was deleted.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum Deletion {
-    /// Its owner asked for it.
-    Requested,
-    /// It was kept long enough.
-    Retention,
-}
-
-impl Deletion {
-    pub(super) const ALL: [Deletion; 2] = [Deletion::Requested, Deletion::Retention];
-
-    pub(super) fn name(self) -> &'static str {
-        match self {
-            Deletion::Requested => "REQUESTED",
-            Deletion::Retention => "RETENTION",
-        }
+scpsfm_core::named! {
+    /// Why a job was deleted.
+    pub enum Deletion {
+        /// Its owner asked for it.
+        Requested = "REQUESTED",
+        /// It was kept long enough.
+        Retention = "RETENTION",
     }
 }
 
-/// Files that are read again when they change.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum Reloaded {
-    /// The server's certificate, its key and the authorities of its clients.
-    Certificates,
-    /// The API keys.
-    Keys,
-}
-
-impl Reloaded {
-    pub(super) const ALL: [Reloaded; 2] = [Reloaded::Certificates, Reloaded::Keys];
-
-    pub(super) fn name(self) -> &'static str {
-        match self {
-            Reloaded::Certificates => "CERTIFICATES",
-            Reloaded::Keys => "KEYS",
-        }
+scpsfm_core::named! {
+    /// Files that are read again when they change.
+    pub enum Reloaded {
+        /// The server's certificate, its key and the authorities of its clients.
+        Certificates = "CERTIFICATES",
+        /// The API keys.
+        Keys = "KEYS",
     }
 }
 
@@ -230,82 +171,43 @@ impl std::fmt::Display for Reloaded {
     }
 }
 
-/// Why an upload was given up.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum GivenUp {
-    /// Nothing came for too long.
-    Abandoned,
-    /// Its bytes do not have the SHA-256 that its caller named.
-    WrongHash,
-    /// Its bytes are no valid input.
-    Invalid,
-}
-
-impl GivenUp {
-    pub(super) const ALL: [GivenUp; 3] = [GivenUp::Abandoned, GivenUp::WrongHash, GivenUp::Invalid];
-
-    pub(super) fn name(self) -> &'static str {
-        match self {
-            GivenUp::Abandoned => "ABANDONED",
-            GivenUp::WrongHash => "WRONG_HASH",
-            GivenUp::Invalid => "INVALID",
-        }
+scpsfm_core::named! {
+    /// Why an upload was given up.
+    pub enum GivenUp {
+        /// Nothing came for too long.
+        Abandoned = "ABANDONED",
+        /// Its bytes do not have the SHA-256 that its caller named.
+        WrongHash = "WRONG_HASH",
+        /// Its bytes are no valid input.
+        Invalid = "INVALID",
     }
 }
 
-/// What an attempt at a webhook came to.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum WebhookAttempt {
-    /// The receiver accepted it.
-    Delivered,
-    /// It is made again.
-    Failed,
-    /// It failed, and was the last one.
-    GivenUp,
-}
-
-impl WebhookAttempt {
-    pub(super) const ALL: [WebhookAttempt; 3] =
-        [WebhookAttempt::Delivered, WebhookAttempt::Failed, WebhookAttempt::GivenUp];
-
-    pub(super) fn name(self) -> &'static str {
-        match self {
-            WebhookAttempt::Delivered => "DELIVERED",
-            WebhookAttempt::Failed => "FAILED",
-            WebhookAttempt::GivenUp => "GIVEN_UP",
-        }
+scpsfm_core::named! {
+    /// What an attempt at a webhook came to.
+    pub enum WebhookAttempt {
+        /// The receiver accepted it.
+        Delivered = "DELIVERED",
+        /// It is made again.
+        Failed = "FAILED",
+        /// It failed, and was the last one.
+        GivenUp = "GIVEN_UP",
     }
 }
 
-/// How an attempt ended that did not end its job.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum AttemptLost {
-    /// Given back to the queue at a drain.
-    GivenBack,
-    /// Another worker took the lease over; the outcome was dropped.
-    Fenced,
-    /// The lease ran out without a heartbeat: the process that held it died.
-    LeaseExpired,
-}
-
-impl AttemptLost {
-    pub(super) const ALL: [AttemptLost; 3] = [AttemptLost::GivenBack, AttemptLost::Fenced, AttemptLost::LeaseExpired];
-
-    pub(super) fn name(self) -> &'static str {
-        match self {
-            AttemptLost::GivenBack => "GIVEN_BACK",
-            AttemptLost::Fenced => "FENCED",
-            AttemptLost::LeaseExpired => "LEASE_EXPIRED",
-        }
+scpsfm_core::named! {
+    /// How an attempt ended that did not end its job.
+    pub enum AttemptLost {
+        /// Given back to the queue at a drain.
+        GivenBack = "GIVEN_BACK",
+        /// Another worker took the lease over; the outcome was dropped.
+        Fenced = "FENCED",
+        /// The lease ran out without a heartbeat: the process that held it died.
+        LeaseExpired = "LEASE_EXPIRED",
     }
 }
 
 /// Label of the grade of a result.
 pub(super) fn grade_name(grade: Option<Grade>) -> &'static str {
-    match grade {
-        Some(Grade::Metric) => "METRIC",
-        Some(Grade::Weak) => "WEAK",
-        Some(Grade::ProjectiveOnly) => "PROJECTIVE_ONLY",
-        None => NONE,
-    }
+    grade.map_or(NONE, Grade::name)
 }

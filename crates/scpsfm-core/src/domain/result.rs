@@ -27,28 +27,19 @@ pub enum Status {
     NoReconstruction,
 }
 
-/// How far a calibration can be relied on, from the standard deviation of the log of the focal length.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Serialize, Deserialize)]
-#[serde(rename_all = "SCREAMING_SNAKE_CASE")]
-pub enum Grade {
-    /// sigma < .02
-    Metric,
-    /// .02 <= sigma <= .1
-    Weak,
-    /// sigma > .1, or a motion or scene that carries no calibration: only the projective part is to be used.
-    ProjectiveOnly,
+named! {
+    /// How far a calibration can be relied on, from the standard deviation of the log of the focal length.
+    pub enum Grade {
+        /// sigma < .02
+        Metric = "METRIC",
+        /// .02 <= sigma <= .1
+        Weak = "WEAK",
+        /// sigma > .1, or a motion or scene that carries no calibration: only the projective part is to be used.
+        ProjectiveOnly = "PROJECTIVE_ONLY",
+    }
 }
 
 impl Grade {
-    /// The grade as it stands in files, metrics and words.
-    pub fn name(self) -> &'static str {
-        match self {
-            Grade::Metric => "METRIC",
-            Grade::Weak => "WEAK",
-            Grade::ProjectiveOnly => "PROJECTIVE_ONLY",
-        }
-    }
-
     /// The one of the two that promises less.
     pub fn worse(self, other: Self) -> Self {
         match (self, other) {

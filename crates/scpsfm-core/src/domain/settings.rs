@@ -4,39 +4,26 @@ use serde::{Deserialize, Serialize};
 
 use super::error::{InvalidInput, Violation, Violations};
 
-/// Which tracks are right is decided by...
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Default, Serialize, Deserialize)]
-#[serde(rename_all = "SCREAMING_SNAKE_CASE")]
-pub enum Method {
-    /// ...the network's prior and geometry together: the network proposes, geometry disposes.
-    #[default]
-    Auto,
-    /// ...the paper's network under the paper's objective as printed: its weights, thresholded at 1/2.
-    Paper,
-    /// ...geometry alone, no network.
-    Geometry,
-    /// ...plain projective factorisation (Sturm & Triggs 1996) with a residual threshold.
-    Psfm,
-    /// ...the paper's network by itself under a continued objective: the weights of the best of several optimisations,
-    /// thresholded at 1/2.
-    Scpsfm,
+named! {
+    /// Which tracks are right is decided by...
+    #[derive(Default)]
+    pub enum Method {
+        /// ...the network's prior and geometry together: the network proposes, geometry disposes.
+        #[default]
+        Auto = "AUTO",
+        /// ...the paper's network under the paper's objective as printed: its weights, thresholded at 1/2.
+        Paper = "PAPER",
+        /// ...geometry alone, no network.
+        Geometry = "GEOMETRY",
+        /// ...plain projective factorisation (Sturm & Triggs 1996) with a residual threshold.
+        Psfm = "PSFM",
+        /// ...the paper's network by itself under a continued objective: the weights of the best of several optimisations,
+        /// thresholded at 1/2.
+        Scpsfm = "SCPSFM",
+    }
 }
 
 impl Method {
-    /// Every method, in the order of the API's enum.
-    pub const ALL: [Method; 5] = [Method::Auto, Method::Paper, Method::Geometry, Method::Psfm, Method::Scpsfm];
-
-    /// The method's name in files and on the command line.
-    pub fn name(self) -> &'static str {
-        match self {
-            Method::Auto => "AUTO",
-            Method::Paper => "PAPER",
-            Method::Geometry => "GEOMETRY",
-            Method::Psfm => "PSFM",
-            Method::Scpsfm => "SCPSFM",
-        }
-    }
-
     /// Whether the method optimises the network.
     pub fn uses_network(self) -> bool {
         matches!(self, Method::Auto | Method::Paper | Method::Scpsfm)
