@@ -12,3 +12,7 @@ pub use input_name::InputName;
 pub use quota::{Oversize, Quota};
 pub use scpsfm_core::domain::*;
 pub use webhook::{Webhook, WebhookState};
+
+/// Observations of an input that is checked, encoded, hashed and read where that is asked for: some 40 kB, which take
+/// less time than to wake another thread does.
+pub const FEW_OBSERVATIONS: u32 = 2_000;

@@ -53,8 +53,8 @@ pub(super) async fn in_time<T>(
 }
 
 /// The input of a job, with the cancel that may have come before the job was listed as running.
-async fn read(store: Arc<Store>, name: JobName, stop: StopToken) -> Result<Vec<u8>, store::Error> {
-    let payload = store.job_payload(&name).await?;
+async fn read(store: Arc<Store>, name: JobName, observations: u32, stop: StopToken) -> Result<Vec<u8>, store::Error> {
+    let payload = store.job_payload(&name, observations).await?;
     if payload.cancel_requested {
         stop.stop(StopReason::Cancelled);
     }
@@ -228,7 +228,8 @@ impl JobExecution {
     /// none for a prefetched job.
     async fn read_input(&mut self) -> Result<Vec<u8>, AttemptOutcome> {
         loop {
-            let mut reading = pin!(read(self.inner.store.clone(), self.job.name.clone(), self.stop.clone()));
+            let (name, observations) = (self.job.name.clone(), self.job.observation_count);
+            let mut reading = pin!(read(self.inner.store.clone(), name, observations, self.stop.clone()));
             let mut heartbeats = self.heartbeats();
             let input = loop {
                 tokio::select! {

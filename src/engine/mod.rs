@@ -245,15 +245,15 @@ impl Engine {
         &self.inner.options
     }
 
-    /// The encoded result of a succeeded job.
+    /// The encoded result of a job, which had succeeded when it was read.
     ///
     /// # Errors
     /// [`StoreError::NotFound`], [`Error::NotReady`] for a job in any other state, [`StoreError::Corrupt`] for a result
     /// that is not what was stored.
-    pub async fn result(&self, name: &JobName) -> Result<EncodedResult, Error> {
-        let state = self.inner.store.job(name).await?.state;
-        if state != JobState::Succeeded {
-            return Err(Error::NotReady(state));
+    pub async fn result(&self, job: &Job) -> Result<EncodedResult, Error> {
+        let name = &job.name;
+        if job.state != JobState::Succeeded {
+            return Err(Error::NotReady(job.state));
         }
         let result = self.inner.store.result(name).await?.ok_or_else(|| StoreError::NotFound(name.clone()))?;
         let corrupt = store::Error::Corrupt(format!("the result of {name} is not what was stored"));

@@ -8,7 +8,7 @@ use sha2::{Digest, Sha256};
 use super::{Engine, Error, Inner, StoreError, WebhookOptions, finished, observe, webhooks};
 use crate::domain::error::{Violation, Violations, quoted};
 use crate::domain::job::{Job, JobName};
-use crate::domain::{Backend, Input, InputName, Oversize, Quota, SolveSettings};
+use crate::domain::{Backend, FEW_OBSERVATIONS, Input, InputName, Oversize, Quota, SolveSettings};
 use crate::solver;
 use crate::store::{self, NewRecord, Request, StoredInput, payload};
 
@@ -80,10 +80,6 @@ pub struct NewJob {
     /// Whether the call attaches to the job, see [`Engine::detach`]. No part of what makes two requests the same.
     pub cancel_on_disconnect: bool,
 }
-
-/// Observations that are encoded on a thread that serves others: some 40 kB to encode and to hash, which needs no
-/// thread of its own.
-const FEW_OBSERVATIONS: usize = 2_000;
 
 impl NewJob {
     fn validate(&self, webhooks: Option<&WebhookOptions>) -> Result<(), Error> {
@@ -188,7 +184,7 @@ impl Engine {
             let each = news.into_iter().zip(uploaded);
             each.map(|(new, uploaded)| new.into_record(uploaded, now, backend)).collect::<Result<Vec<_>, _>>()
         };
-        let records = if observations <= FEW_OBSERVATIONS {
+        let records = if observations <= FEW_OBSERVATIONS as usize {
             encode()?
         } else {
             finished(tokio::task::spawn_blocking(encode)).await?

@@ -62,16 +62,8 @@ impl Engine {
         if weights.borrow().is_some() {
             weights.mark_changed();
         }
-        let job = inner.store.job(&name).await?;
-        if after > job.last_sequence {
-            let description =
-                format!("{after} is beyond the job's latest event {}; start from one received", job.last_sequence);
-            return Err(Error::InvalidArgument(Violation::of("after_sequence", description).into()));
-        }
-        // An end is the last event as long as the job is not retried: nothing to wait for.
-        let ended = job.state.is_terminal() && after == job.last_sequence;
         let phase = inner.phase.subscribe();
-        Ok(Watch {
+        let mut watch = Watch {
             inner,
             name,
             version,
@@ -80,9 +72,21 @@ impl Engine {
             buffered: VecDeque::new(),
             after,
             caught_up: false,
-            ended,
+            ended: false,
             _subscription: subscription,
-        })
+        };
+        watch.read().await?;
+        if watch.buffered.is_empty() {
+            let job = watch.inner.store.job(&watch.name).await?;
+            if after > job.last_sequence {
+                let latest = job.last_sequence;
+                let description = format!("{after} is beyond the job's latest event {latest}; start from one received");
+                return Err(Error::InvalidArgument(Violation::of("after_sequence", description).into()));
+            }
+            // An end is the last event as long as the job is not retried: nothing to wait for.
+            watch.ended = job.state.is_terminal() && after == job.last_sequence;
+        }
+        Ok(watch)
     }
 }
 
@@ -110,6 +114,17 @@ impl Watch {
         stream::unfold(self, |mut watch| async move { watch.next().await.map(|event| (event, watch)) })
     }
 
+    /// Reads what is in the store beyond `after`, or some of it.
+    async fn read(&mut self) -> Result<(), Error> {
+        self.version.mark_unchanged();
+        self.caught_up = false;
+        let read = self.inner.store.events_after(&self.name, self.after, READ_AHEAD).await?;
+        self.caught_up = read.len() < READ_AHEAD as usize;
+        self.buffered.extend(read);
+        self.after = self.buffered.back().and_then(|event| event.sequence).unwrap_or(self.after);
+        Ok(())
+    }
+
     async fn advance(&mut self) -> Result<JobEvent, Error> {
         loop {
             // Where an end is the last event that was read, and not all were, a retry may follow it.
@@ -118,12 +133,7 @@ impl Watch {
                 return Ok(event);
             }
             if !self.caught_up || self.version.has_changed().unwrap_or(true) {
-                self.version.mark_unchanged();
-                self.caught_up = false;
-                let read = self.inner.store.events_after(&self.name, self.after, READ_AHEAD).await?;
-                self.caught_up = read.len() < READ_AHEAD as usize;
-                self.buffered.extend(read);
-                self.after = self.buffered.back().and_then(|event| event.sequence).unwrap_or(self.after);
+                self.read().await?;
                 continue;
             }
             if *self.phase.borrow_and_update() == Phase::Closed {

@@ -79,13 +79,13 @@ impl Jobs {
         let engine = self.engine.clone();
         // In a task of its own: what is read is held to its end, also when the call is dropped.
         let reading = async move {
-            let summary = engine.job(&name).await?.summary;
-            let bytes = summary.map_or(0, |summary| summary.result_size_bytes);
+            let job = engine.job(&name).await?;
+            let bytes = job.summary.as_ref().map_or(0, |summary| summary.result_size_bytes);
             if bytes > largest {
                 return Err(status::result_too_large(&name, bytes, largest));
             }
             permit.hold(WORKING_COPIES.saturating_mul(bytes))?;
-            Ok(engine.result(&name).await?)
+            Ok(engine.result(&job).await?)
         };
         let read = tokio::spawn(reading.in_current_span()).await;
         read.map_err(|error| status::internal(&error))?

@@ -8,11 +8,11 @@ use tracing::Instrument;
 
 use super::caller::Caller;
 use super::convert::create;
-use super::convert::input::{Draft, field_of};
+use super::convert::input::{Draft, OBSERVATION_BYTES, field_of};
 use super::inflight::{Permit, WORKING_COPIES};
 use super::{proto, status};
 use crate::domain::job::Job;
-use crate::domain::{InputName, InvalidInput, Limits, Violation};
+use crate::domain::{FEW_OBSERVATIONS, InputName, InvalidInput, Limits, Violation};
 use crate::engine::{self, Engine, JobDescription, JobInput, NewJob};
 use crate::telemetry::metrics::{Refusal, refused};
 use proto::create_job_request::Source as Inline;
@@ -97,13 +97,14 @@ impl Submission {
         let input = match input {
             Source::Uploaded(name) => JobInput::Uploaded(name),
             Source::Draft(draft) => {
-                // Sorting millions of observations takes a second: not on a thread that serves others.
+                let is_small = draft.bytes() <= u64::from(FEW_OBSERVATIONS) * OBSERVATION_BYTES;
                 let finish = move || {
                     // Held here as well: what computes goes on when the call is dropped.
                     let _permit = permit;
                     draft.finish()
                 };
-                let checked = super::blocking(finish).await?;
+                // Sorting millions of observations takes a second: not on a thread that serves others.
+                let checked = if is_small { finish() } else { super::blocking(finish).await? };
                 JobInput::Inline(checked.map_err(invalid)?)
             }
         };

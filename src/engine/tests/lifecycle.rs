@@ -36,10 +36,10 @@ async fn a_defect_fails_its_job_and_the_worker_goes_on() {
     {
         let name = test.submit(behavior).await;
         let job = test.ended(&name).await;
-        let failure = job.failure.expect("a reason");
+        let failure = job.failure.as_ref().expect("a reason");
         assert_eq!((job.state, failure.reason.as_str()), (JobState::Failed, "INTERNAL"));
         assert_eq!(failure.message, message);
-        assert_eq!(test.engine.result(&name).await, Err(Error::NotReady(JobState::Failed)));
+        assert_eq!(test.engine.result(&job).await, Err(Error::NotReady(JobState::Failed)));
     }
     let name = test.submit(Behavior::Succeed).await;
     assert_eq!(test.ended(&name).await.state, JobState::Succeeded);
@@ -84,7 +84,8 @@ async fn a_cancel_reaches_a_queued_a_running_and_no_ended_job() {
     let events = rest(&mut watch).await;
     assert_eq!(events.iter().map(terminal).collect::<Vec<_>>(), [Some(JobState::Cancelled)]);
 
-    assert_eq!(test.engine.result(&running).await, Err(Error::NotReady(JobState::Running)));
+    let job = test.engine.job(&running).await.expect("exists");
+    assert_eq!(test.engine.result(&job).await, Err(Error::NotReady(JobState::Running)));
     let flagged = test.engine.cancel(&running, None).await.expect("exists");
     assert!(flagged.state == JobState::Running && flagged.cancel_requested, "{flagged:?}");
     let job = test.ended(&running).await;

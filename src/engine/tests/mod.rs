@@ -123,7 +123,7 @@ fn encode(_: &JobName, solution: &Solution) -> Vec<u8> {
 
 /// Which call of the solver made a job's result.
 async fn call_of(engine: &Engine, name: &JobName) -> u32 {
-    let result = engine.result(name).await.expect("ready");
+    let result = engine.result(&engine.job(name).await.expect("exists")).await.expect("ready");
     u32::from_le_bytes(result.bytes.try_into().expect("four bytes"))
 }
 

@@ -38,7 +38,11 @@ pub(in crate::store) async fn a_retried_job_begins_anew_and_its_events_go_on(sto
     assert_eq!((&job.labels, job.create_time), (&failed.labels, time(0)));
     assert_ne!(job.etag(), failed.etag());
     assert_eq!(store.job(&name).await, Ok(job.clone()));
-    assert_eq!(store.job_payload(&name).await.map(|payload| payload.input), Ok(vec![7; 100]), "the input was kept");
+    assert_eq!(
+        store.job_payload(&name, u32::MAX).await.map(|payload| payload.input),
+        Ok(vec![7; 100]),
+        "the input was kept"
+    );
     // Kept for as long as any job that waits.
     assert_eq!(store.purge(time(1_000_000), 10).await, Ok(0));
     // Once more, as after an answer that was lost.

@@ -45,7 +45,7 @@ pub(in crate::store) async fn a_created_job_reads_back(store: &Store) {
     };
     assert_eq!(created.job, expected);
     assert_eq!(store.job(&new.name).await, Ok(expected));
-    assert_eq!(store.job_payload(&new.name).await.map(|payload| payload.input), Ok(input));
+    assert_eq!(store.job_payload(&new.name, u32::MAX).await.map(|payload| payload.input), Ok(input));
     assert_eq!(result_of(store, &new.name).await, Ok(None));
     assert_eq!(story(store, &new.name).await, told(&[(1, 0, "QUEUED")]));
     let claimed = claim(store, 1).await;
@@ -179,7 +179,7 @@ pub(in crate::store) async fn a_batch_is_stored_whole_or_not_at_all(store: &Stor
     let created: Vec<_> = created.iter().map(|created| (created.job.name.job.as_str(), created.by_this_call)).collect();
     assert_eq!(created, [("a", true), ("b", true)]);
     assert_eq!(store.queue_stats().await.expect("counts").queued_bytes, 300);
-    assert_eq!(store.job_payload(&record("b").name).await.map(|payload| payload.input), Ok(vec![7; 100]));
+    assert_eq!(store.job_payload(&record("b").name, u32::MAX).await.map(|payload| payload.input), Ok(vec![7; 100]));
 }
 
 pub(in crate::store) async fn a_batch_knows_its_request_ids(store: &Store) {

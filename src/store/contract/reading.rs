@@ -73,7 +73,7 @@ pub(in crate::store) async fn what_does_not_exist_is_not_found(store: &Store) {
     let name = JobName { tenant: "u".into(), job: "a".into() };
     let missing = Error::NotFound(name.clone());
     assert_eq!(store.job(&name).await, Err(missing.clone()));
-    assert_eq!(store.job_payload(&name).await.map(|payload| payload.input), Err(missing.clone()));
+    assert_eq!(store.job_payload(&name, u32::MAX).await.map(|payload| payload.input), Err(missing.clone()));
     assert_eq!(result_of(store, &name).await, Err(missing.clone()));
     assert_eq!(store.events_after(&name, 0, 1).await, Err(missing.clone()));
     assert_eq!(store.request_cancel(&name, None, time(0)).await, Err(missing));

@@ -27,13 +27,13 @@ pub(in crate::store) async fn an_ended_job_goes_with_all_that_it_had(store: &Sto
     let missing = Error::NotFound(name.clone());
     assert_eq!(store.job(&name).await, Err(missing.clone()));
     assert_eq!(store.events_after(&name, 0, 10).await, Err(missing.clone()));
-    assert_eq!(store.job_payload(&name).await.map(|payload| payload.input), Err(missing.clone()));
+    assert_eq!(store.job_payload(&name, u32::MAX).await.map(|payload| payload.input), Err(missing.clone()));
     assert_eq!(result_of(store, &name).await, Err(missing.clone()));
     assert_eq!(store.delete_job(&name, None).await, Err(missing));
     let query = JobQuery { tenant: "t".into(), labels, ..JobQuery::default() };
     assert!(store.jobs(&query).await.expect("lists").items.is_empty());
     assert_eq!(store.job(&other.name).await, Ok(other.clone()), "others stay");
-    assert_eq!(store.job_payload(&other.name).await.map(|payload| payload.input), Ok(vec![7; 100]));
+    assert_eq!(store.job_payload(&other.name, u32::MAX).await.map(|payload| payload.input), Ok(vec![7; 100]));
     assert_eq!(result_of(store, &other.name).await, Ok(Some(vec![1, 2, 3])));
     // Name and request id are free again, and the new job has nothing of the old one.
     let created = store.create_job(new, &ROOM, time(5)).await.expect("created");

@@ -215,7 +215,7 @@ pub(in crate::store) async fn an_input_lives_as_long_as_a_job_has_it(store: &Sto
     let job = create(store, of("a", "used"), 5).await;
     assert_eq!(job.input, Some(name("used")));
     create(store, of("b", "used"), 5).await;
-    assert_eq!(store.job_payload(&job.name).await.map(|payload| payload.input), Ok(payload.clone()));
+    assert_eq!(store.job_payload(&job.name, u32::MAX).await.map(|payload| payload.input), Ok(payload.clone()));
     assert_eq!(store.queue_stats().await.expect("counts").queued_bytes, 100);
     let missing = store.create_job(of("c", "none"), &ROOM, time(5)).await;
     assert_eq!(missing.expect_err("no such input"), Error::InputNotFound(name("none")));
@@ -236,7 +236,7 @@ pub(in crate::store) async fn an_input_lives_as_long_as_a_job_has_it(store: &Sto
     assert_eq!(store.upload(&name("unused")).await, Err(Error::UploadNotFound(name("unused"))));
     for job in ["a", "b", "d"] {
         let job = record(job).name;
-        assert_eq!(store.job_payload(&job).await.map(|payload| payload.input), Ok(payload.clone()));
+        assert_eq!(store.job_payload(&job, u32::MAX).await.map(|payload| payload.input), Ok(payload.clone()));
         store.request_cancel(&job, None, time(6)).await.expect("ends");
         store.delete_job(&job, None).await.expect("deletes");
     }
@@ -320,11 +320,11 @@ pub(in crate::store) async fn a_deleted_input_is_kept_by_its_jobs_alone(store: &
     store.finish_upload(&lease, &input(vec![9; 10]), time(3)).await.expect("finishes");
     // Each job has the old bytes to its end, also once the other is gone.
     for (job, other) in [(&a, Some(&b)), (&b, None)] {
-        assert_eq!(store.job_payload(job).await.map(|payload| payload.input), Ok(payload.clone()));
+        assert_eq!(store.job_payload(job, u32::MAX).await.map(|payload| payload.input), Ok(payload.clone()));
         store.request_cancel(job, None, time(4)).await.expect("ends");
         store.delete_job(job, None).await.expect("deletes");
         if let Some(other) = other {
-            assert_eq!(store.job_payload(other).await.map(|payload| payload.input), Ok(payload.clone()));
+            assert_eq!(store.job_payload(other, u32::MAX).await.map(|payload| payload.input), Ok(payload.clone()));
         }
     }
     assert!(store.uploaded_input(&name("shared")).await.is_ok(), "the new one has nothing to do with them");

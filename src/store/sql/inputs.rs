@@ -7,7 +7,7 @@ use super::Size::{Payload, Small};
 use super::WriteIntent::Ends;
 use super::operation::{ANY_BYTES, reads, writes};
 use super::rows::{self, micros, number};
-use super::{Connection, Database, Row, Statement};
+use super::{Connection, Database, Row, Size, Statement};
 use crate::domain::input_name::InputName;
 use crate::store::query::Paged;
 use crate::store::upload::{PurgedUploads, StoredInput};
@@ -54,7 +54,7 @@ impl dyn Database {
     /// # Errors
     /// [`Error::PageToken`].
     pub async fn inputs(&self, query: &InputQuery) -> Result<Page<StoredInput>, Error> {
-        reads!(self, "inputs", Small, |connection| {
+        reads!(self, "inputs", Size::Page, |connection| {
             let select = Statement::new(select_inputs!("WHERE input IS NOT NULL AND tenant = "));
             let mut select = select.then_bind(&query.tenant);
             if let Some(cursor) = query.cursor()? {

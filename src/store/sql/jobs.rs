@@ -2,15 +2,16 @@
 
 use std::time::SystemTime;
 
-use super::Size::{Payload, Small};
+use super::Size::{Page, Small};
 use super::WriteIntent::Ends;
 use super::operation::{bounded, reads, writes};
 use super::rows::{self, integer, micros, number, returning_job, select_jobs};
-use super::{Connection, Database, Row, Statement};
+use super::{Connection, Database, Row, Size, Statement};
+use crate::domain::FEW_OBSERVATIONS;
 use crate::domain::job::{Job, JobEvent, JobName};
 use crate::store::query::Paged;
 use crate::store::record::{EncodedResult, JobPayload, QueueStats, StoreStats, TenantQueue};
-use crate::store::{Error, JobQuery, Order, Page, payload};
+use crate::store::{self, Error, JobQuery, Order, payload};
 use crate::telemetry::metrics::store_operation;
 
 impl dyn Database {
@@ -24,8 +25,8 @@ impl dyn Database {
     ///
     /// # Errors
     /// [`Error::PageToken`].
-    pub async fn jobs(&self, query: &JobQuery) -> Result<Page<Job>, Error> {
-        reads!(self, "jobs", Small, |connection| {
+    pub async fn jobs(&self, query: &JobQuery) -> Result<store::Page<Job>, Error> {
+        reads!(self, "jobs", Page, |connection| {
             let cursor = query.cursor()?;
             let mut select = Statement::new(select_jobs!("WHERE tenant = ")).then_bind(&query.tenant);
             for (number, state) in query.states.iter().enumerate() {
@@ -84,12 +85,13 @@ impl dyn Database {
         })
     }
 
-    /// The encoded input of a job, and whether its cancel has been asked for.
+    /// The encoded input of a job of so many observations, and whether its cancel has been asked for.
     ///
     /// # Errors
     /// [`Error::NotFound`].
-    pub async fn job_payload(&self, name: &JobName) -> Result<JobPayload, Error> {
-        reads!(self, "work", Payload, |connection| {
+    pub async fn job_payload(&self, name: &JobName, observations: u32) -> Result<JobPayload, Error> {
+        let size = if observations <= FEW_OBSERVATIONS { Small } else { Size::Payload };
+        reads!(self, "work", size, |connection| {
             let select = Statement::new(
                 "SELECT data, cancel_requested FROM jobs JOIN input_chunks ON input_chunks.input_id = jobs.input_id \
                  WHERE tenant = $1 AND job = $2 ORDER BY chunk",
@@ -107,7 +109,7 @@ impl dyn Database {
     /// # Errors
     /// [`Error::NotFound`].
     pub async fn result(&self, name: &JobName) -> Result<Option<EncodedResult>, Error> {
-        reads!(self, "result", Payload, |connection| {
+        reads!(self, "result", Size::Payload, |connection| {
             // In one look: between two the job may be deleted.
             let select = Statement::new(
                 "SELECT result_sha256, data FROM jobs LEFT JOIN result_chunks ON result_chunks.job_id = jobs.id \
@@ -143,13 +145,13 @@ impl dyn Database {
 
     /// What waits and what runs.
     pub async fn queue_stats(&self) -> Result<QueueStats, Error> {
-        reads!(self, "load", Small, |connection| connection.queue_stats().await)
+        reads!(self, "load", Page, |connection| connection.queue_stats().await)
     }
 
     /// What operators watch.
     pub async fn stats(&self) -> Result<StoreStats, Error> {
         let _timer = store_operation("stats");
-        let (tenants, oldest_queue_time) = reads!(self, Small, |connection| {
+        let (tenants, oldest_queue_time) = reads!(self, Page, |connection| {
             let select = Statement::new(
                 "SELECT tenant, COUNT(*) FILTER (WHERE state = 'QUEUED') AS queued, \
                  COUNT(*) FILTER (WHERE state = 'RUNNING') AS running, \
