@@ -113,7 +113,7 @@ async fn cancelled_between_its_begin_and_its_lease_it_leaves_nothing() {
     let third = test.submit(Behavior::Succeed).await;
     assert_eq!(test.ended(&third).await.state, JobState::Succeeded);
     assert_eq!(states(&test, &next).await, [JobState::Queued, JobState::Cancelled]);
-    assert!(test.store.result(&next).await.expect("answers").is_none());
+    assert!(test.store.result(&next, u32::MAX).await.expect("answers").is_none());
     nothing_is_left(&test).await;
 }
 

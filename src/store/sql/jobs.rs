@@ -7,7 +7,6 @@ use super::WriteIntent::Ends;
 use super::operation::{bounded, reads, writes};
 use super::rows::{self, integer, micros, number, returning_job, select_jobs};
 use super::{Connection, Database, Row, Size, Statement};
-use crate::domain::FEW_OBSERVATIONS;
 use crate::domain::job::{Job, JobEvent, JobName};
 use crate::store::query::Paged;
 use crate::store::record::{EncodedResult, JobPayload, QueueStats, StoreStats, TenantQueue};
@@ -90,8 +89,7 @@ impl dyn Database {
     /// # Errors
     /// [`Error::NotFound`].
     pub async fn job_payload(&self, name: &JobName, observations: u32) -> Result<JobPayload, Error> {
-        let size = if observations <= FEW_OBSERVATIONS { Small } else { Size::Payload };
-        reads!(self, "work", size, |connection| {
+        reads!(self, "work", Size::of_payload(observations), |connection| {
             let select = Statement::new(
                 "SELECT data, cancel_requested FROM jobs JOIN input_chunks ON input_chunks.input_id = jobs.input_id \
                  WHERE tenant = $1 AND job = $2 ORDER BY chunk",
@@ -103,13 +101,13 @@ impl dyn Database {
         })
     }
 
-    /// The encoded result of a job; `None` where there is none. Whether it is intact is for the caller to ask: it takes
-    /// long.
+    /// The encoded result of a job of so many observations; `None` where there is none. Whether it is intact is for the
+    /// caller to ask: it takes long.
     ///
     /// # Errors
     /// [`Error::NotFound`].
-    pub async fn result(&self, name: &JobName) -> Result<Option<EncodedResult>, Error> {
-        reads!(self, "result", Size::Payload, |connection| {
+    pub async fn result(&self, name: &JobName, observations: u32) -> Result<Option<EncodedResult>, Error> {
+        reads!(self, "result", Size::of_payload(observations), |connection| {
             // In one look: between two the job may be deleted.
             let select = Statement::new(
                 "SELECT result_sha256, data FROM jobs LEFT JOIN result_chunks ON result_chunks.job_id = jobs.id \

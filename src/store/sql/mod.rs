@@ -23,6 +23,7 @@ use sqlx::SqlSafeStr;
 use sqlx::migrate::{Migration, MigrationType, Migrator};
 
 use super::{Error, Notification};
+use crate::domain::FEW_OBSERVATIONS;
 pub(super) use rows::{micros, time};
 pub(super) use statement::{Row, Statement, Value};
 
@@ -170,6 +171,13 @@ pub enum Size {
     Payload,
     /// A result, under a lease that may run out.
     Outcome,
+}
+
+impl Size {
+    /// That of the input, or of the result, of a job of so many observations.
+    fn of_payload(observations: u32) -> Self {
+        if observations <= FEW_OBSERVATIONS { Self::Small } else { Self::Payload }
+    }
 }
 
 /// What an operation does to the room on the disk.

@@ -19,7 +19,6 @@ mod writer;
 
 use std::fs::{File, TryLockError};
 use std::path::{Path, PathBuf};
-use std::sync::Arc;
 use std::time::{Duration, SystemTime};
 
 use super::clock::LeaseClock;
@@ -59,7 +58,7 @@ pub struct Sqlite {
     writer: Writer,
     has_room: SpaceFlag,
     clock: LeaseClock,
-    readers: Arc<Readers>,
+    readers: Readers,
     /// The database and its write-ahead log.
     files: [PathBuf; 2],
     /// Unlocked when it is closed, also by the death of the process.
@@ -95,7 +94,7 @@ impl Sqlite {
         }
         let has_room = ballast.space_flag();
         let files = [database.clone(), schema::log_of(&database)];
-        let readers = Readers::new(database.clone());
+        let readers = Readers::open(database.clone())?;
         let writer = Writer::start(connection, database, ballast, group_time)?;
         let clock = LeaseClock::new(Clock::default());
         Ok(Self { writer, has_room, clock, readers, files, _lock: lock })
@@ -133,7 +132,7 @@ impl Database for Sqlite {
     }
 
     async fn reader(&self, size: Size) -> Result<Box<dyn Connection>, Error> {
-        Ok(Box::new(self.readers.acquire(size).await?))
+        Ok(Box::new(self.readers.reader(size)))
     }
 
     async fn write(
@@ -184,7 +183,7 @@ impl Database for Sqlite {
     }
 
     async fn disconnect(&self) {
-        self.readers.close().await;
+        self.readers.close();
         self.writer.close().await;
     }
 }

@@ -135,9 +135,9 @@ async fn a_read_that_is_given_up_leaves_its_connection_to_others() {
     let name = created.job.name;
     for number in 0..20 {
         // Off this thread: it has begun, or waits for a connection.
-        assert!(fixture.result(&name).now_or_never().is_none(), "read {number}");
+        assert!(fixture.result(&name, u32::MAX).now_or_never().is_none(), "read {number}");
     }
-    assert_eq!(fixture.result(&name).await, Ok(None));
+    assert_eq!(fixture.result(&name, u32::MAX).await, Ok(None));
     fixture.job(&name).await.expect("is there");
 }
 

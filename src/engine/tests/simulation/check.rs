@@ -113,7 +113,7 @@ async fn came_right(store: &Store, job: &Job, is_disturbed: bool) -> Result<(), 
     match job.state {
         JobState::Succeeded => {
             ensure!(behavior == JobBehavior::Succeed, "a job that cannot succeed has");
-            let result = store.result(&job.name).await.map_err(|error| error.to_string())?;
+            let result = store.result(&job.name, u32::MAX).await.map_err(|error| error.to_string())?;
             let result = result.ok_or("no result")?;
             ensure!(result.is_intact() && result.bytes == result_of(&job.name), "another job's result");
         }
