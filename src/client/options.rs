@@ -33,28 +33,40 @@ pub struct Options {
     pub plaintext_keys: bool,
 }
 
-scpsfm_core::named! {
-    /// What an error is about: the server's address, or a field of [`Options`].
-    #[non_exhaustive]
-    pub enum Setting {
-        /// The address.
-        Server = "server",
-        /// [`Options::tenant`].
-        Tenant = "tenant",
-        /// [`Options::api_key`].
-        ApiKey = "api_key",
-        /// [`Options::tls_ca`].
-        TlsCa = "tls_ca",
-        /// [`Options::tls_cert`].
-        TlsCert = "tls_cert",
-        /// [`Options::tls_key`].
-        TlsKey = "tls_key",
-        /// [`Options::plaintext_keys`].
-        PlaintextKeys = "plaintext_keys",
-    }
+/// What an error is about: the server's address, or a field of [`Options`].
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+#[non_exhaustive]
+pub enum Setting {
+    /// The address.
+    Server,
+    /// [`Options::tenant`].
+    Tenant,
+    /// [`Options::api_key`].
+    ApiKey,
+    /// [`Options::tls_ca`].
+    TlsCa,
+    /// [`Options::tls_cert`].
+    TlsCert,
+    /// [`Options::tls_key`].
+    TlsKey,
+    /// [`Options::plaintext_keys`].
+    PlaintextKeys,
 }
 
 impl Setting {
+    /// Its name in messages, which has it in backquotes.
+    pub fn name(self) -> &'static str {
+        match self {
+            Setting::Server => "server",
+            Setting::Tenant => "tenant",
+            Setting::ApiKey => "api_key",
+            Setting::TlsCa => "tls_ca",
+            Setting::TlsCert => "tls_cert",
+            Setting::TlsKey => "tls_key",
+            Setting::PlaintextKeys => "plaintext_keys",
+        }
+    }
+
     /// An error that begins with the name.
     fn error(self, problem: impl fmt::Display) -> Error {
         ErrorKind::Usage.error(format!("`{}` {problem}", self.name())).about(self)

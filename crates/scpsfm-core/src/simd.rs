@@ -2,6 +2,9 @@
 
 use faer::traits::ComplexField;
 
+/// Numbers that loops over short rows take at a time: those of the widest vectors that most processors have.
+pub const LANES: usize = 4;
+
 /// Runs `work` as compiled for the widest vectors that the processor has.
 ///
 /// Only what is inlined into `work` gains; mark it `#[inline(always)]`. Builds are for the least processor of their

@@ -240,7 +240,8 @@ impl Intrinsics {
             [fx * (radial + bend * u * u + 2.0 * p1 * v + 6.0 * p2 * u), fx * cross],
             [fy * cross, fy * (radial + bend * v * v + 6.0 * p1 * v + 2.0 * p2 * u)],
         ];
-        (by_parameter, by_uv.map(|[by_u, by_v]| Vector3::new(by_u, by_v, -by_u * u - by_v * v) * scale))
+        let by_seen = |[by_u, by_v]: [f64; 2]| Vector3::new(by_u, by_v, -by_u * u - by_v * v) * scale;
+        (by_parameter, [by_seen(by_uv[0]), by_seen(by_uv[1])])
     }
 
     /// Whether a point at this squared tangent of the angle from the optical axis lies before the fold, if there is

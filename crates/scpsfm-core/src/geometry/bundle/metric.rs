@@ -81,14 +81,16 @@ impl<'a> Projection<'a> {
     #[inline(always)]
     pub fn gradients(&self) -> ProjectionGradients {
         let (by_parameter, by_seen) = self.intrinsics.gradients(&self.at);
-        let by_pose = by_seen.map(|by_seen| {
-            let turn = self.at.cross(&by_seen);
+        // Not by `map`, which is not inlined here.
+        let by_pose = std::array::from_fn(|component| {
+            let by_seen: &Vector3<f64> = &by_seen[component];
+            let turn = self.at.cross(by_seen);
             [turn.x, turn.y, turn.z, by_seen.x, by_seen.y, by_seen.z]
         });
         ProjectionGradients {
             by_parameter,
             by_pose,
-            by_point: by_seen.map(|by_seen| self.pose.rotation.tr_mul(&by_seen)),
+            by_point: std::array::from_fn(|component| self.pose.rotation.tr_mul(&by_seen[component])),
         }
     }
 }

@@ -7,7 +7,6 @@ use nalgebra::Vector2;
 use super::super::intrinsics::Parameter;
 use super::super::metric::{POINT, POSE, VIEW};
 use super::super::problem;
-use super::grouped::grouped;
 use super::{Free, MetricReconstruction, Observation};
 
 /// The unknowns of views and groups, in blocks: the free views that see something, then the groups with free
@@ -227,11 +226,6 @@ impl Layout {
         self.seen_starts[points.start]..self.seen_starts[points.end]
     }
 
-    /// Where the observations of each view are among all, ascending.
-    pub fn seen_by_view(&self, views: usize) -> Vec<Vec<u32>> {
-        grouped(views, self.seen.iter().enumerate().map(|(k, seen)| (seen.view, k)))
-    }
-
     /// All observations, sorted by point.
     pub fn all_seen(&self) -> &[Seen] {
         &self.seen
@@ -239,7 +233,10 @@ impl Layout {
 
     /// Points that are coupled with each block, ascending.
     pub fn points_by_block(&self) -> Vec<Vec<u32>> {
-        let blocks = |point: usize| self.incident_blocks(point).iter().map(move |block| (block.block as usize, point));
-        grouped(self.unknowns.block_count(), (0..self.point_count()).flat_map(blocks))
+        let mut points = vec![Vec::new(); self.unknowns.block_count()];
+        for point in 0..self.point_count() {
+            self.incident_blocks(point).iter().for_each(|incident| points[incident.block as usize].push(point as u32));
+        }
+        points
     }
 }

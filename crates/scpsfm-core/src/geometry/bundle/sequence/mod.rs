@@ -8,7 +8,6 @@
 
 mod cost;
 mod embedded_points;
-mod grouped;
 mod layout;
 mod minimise;
 mod normal;

@@ -9,13 +9,12 @@ use super::super::Loss;
 use super::super::metric::{IntrinsicsPrior, POSE, Parameter, Projection, ProjectionGradients, VIEW};
 use super::super::problem::usable_squared_norm;
 use super::MetricReconstruction;
-use super::grouped::within;
 use super::layout::{Layout, Seen};
 use super::pattern::{Pattern, Place};
 use super::point::PointBlock;
 use super::worker_pool::{WorkerPool, split_off};
 use crate::parallel::even_cuts;
-use crate::simd::vectorised;
+use crate::simd::{LANES, vectorised};
 
 /// Where a view's residuals go in the camera part of the normal equations.
 #[derive(Debug, Clone, Copy)]
@@ -66,9 +65,9 @@ impl Weighted {
                 [a * root, b * root, c * root, x * of_shift, y * of_shift, z * of_shift, focal]
             }),
             point: by_point.map(|row| row * root),
-            free: by_parameter.map(|row| {
+            free: std::array::from_fn(|component| {
                 let mut free = [0.0; Parameter::COUNT];
-                let chosen = parameters.iter().map(|parameter| row[*parameter as usize] * root);
+                let chosen = parameters.iter().map(|parameter| by_parameter[component][*parameter as usize] * root);
                 free.iter_mut().zip(chosen).for_each(|(slot, value)| *slot = value);
                 free
             }),
@@ -89,8 +88,6 @@ pub(super) struct Cameras {
     pub gradient: Vec<f64>,
     /// Values and unknowns that belong to the views before each, and to all of them: the groups' come after these.
     before: Vec<(usize, usize)>,
-    /// Where the observations of each view are among all, ascending.
-    by_view: Vec<Vec<u32>>,
 }
 
 /// The normal equations `J' J dx = -J' r`.
@@ -116,8 +113,8 @@ enum Sums<'a> {
 struct Batch<'a> {
     places: &'a [ViewPlaces],
     before: &'a [(usize, usize)],
-    /// Where the batch begins among all observations.
-    first: usize,
+    /// Its observations.
+    seen: &'a [Seen],
     rows: &'a [Option<Weighted>],
 }
 
@@ -133,8 +130,8 @@ impl Normal {
 
     /// Linearises at this state; `false` when it was stopped.
     ///
-    /// Batch by batch: first the rows of the Jacobian and what each point has to itself, then every view adds up its
-    /// own rows, in the order of the observations.
+    /// Batch by batch: first the rows of the Jacobian and what each point has to itself, then the rows are added up by
+    /// views and intrinsics, in the order of the observations.
     pub fn fill(
         &mut self,
         sequence: &MetricReconstruction,
@@ -223,7 +220,6 @@ impl Cameras {
         }
         Self {
             before,
-            by_view: layout.seen_by_view(sequence.poses.len()),
             places: (0..sequence.poses.len()).map(places).collect(),
             diagonal: pattern.diagonal(),
             values: vec![0.0; pattern.value_count()],
@@ -245,11 +241,10 @@ impl Cameras {
 
     /// Adds the rows of a batch.
     fn add_batch(&mut self, pool: &WorkerPool, points: Range<usize>, rows: &[Option<Weighted>]) {
-        let Self { places, values, gradient, before, by_view, .. } = self;
-        let layout = pool.layout;
-        let seen = layout.seen_range(points);
-        let of_batch = |view: usize| within(&by_view[view], &seen);
-        let weights = (0..places.len()).map(|view| of_batch(view).len());
+        let Self { places, values, gradient, before, .. } = self;
+        let seen = &pool.layout.all_seen()[pool.layout.seen_range(points)];
+        let mut weights = vec![0; places.len()];
+        seen.iter().for_each(|seen| weights[seen.view] += 1);
         let (mut values, mut gradient) = (values.as_mut_slice(), gradient.as_mut_slice());
         let cut = |ends: &[usize]| {
             let (first, last) = (before[ends[0]], before[ends[1]]);
@@ -259,18 +254,16 @@ impl Cameras {
                 gradient: split_off(&mut gradient, last.1 - first.1),
             }
         };
-        let mut pieces: Vec<Sums> = even_cuts(pool.threads.pieces(), weights).windows(2).map(cut).collect();
+        let mut pieces: Vec<Sums> = even_cuts(pool.threads.pieces(), weights.into_iter()).windows(2).map(cut).collect();
         // First, for nobody can share it.
         pieces.insert(0, Sums::Groups { values, gradient });
-        let batch = Batch { places, before, first: seen.start, rows };
+        let batch = Batch { places, before, seen, rows };
         pool.threads.each(pieces, |piece: Sums| {
             vectorised(
                 #[inline(always)]
                 || match piece {
-                    Sums::Views { range, values, gradient } => batch.add_to_views(range, values, gradient, of_batch),
-                    Sums::Groups { values, gradient } => {
-                        batch.add_to_groups(&layout.all_seen()[seen.clone()], values, gradient)
-                    }
+                    Sums::Views { range, values, gradient } => batch.add_to_views(range, values, gradient),
+                    Sums::Groups { values, gradient } => batch.add_to_groups(values, gradient),
                 },
             );
             true
@@ -282,28 +275,20 @@ impl Batch<'_> {
     /// Adds to the blocks of a run of views.
     ///
     /// * `values`, `gradient`: those of these views
-    /// * `seen`: observations of a view in this batch, ascending
     #[inline(always)]
-    fn add_to_views<'s>(
-        &self,
-        views: Range<usize>,
-        values: &mut [f64],
-        gradient: &mut [f64],
-        seen: impl Fn(usize) -> &'s [u32],
-    ) {
+    fn add_to_views(&self, views: Range<usize>, values: &mut [f64], gradient: &mut [f64]) {
         let (first_value, first_unknown) = self.before[views.start];
         let of_views = |place: Place| Place { start: place.start - first_value, ..place };
-        for view in views {
-            let ViewPlaces { view: Some((first, unknowns, place)), group, cross } = self.places[view] else { continue };
-            let gradient = &mut gradient[first - first_unknown..];
-            for &k in seen(view) {
-                let Some(row) = &self.rows[k as usize - self.first] else { continue };
-                let own = [&row.view[0][..unknowns], &row.view[1][..unknowns]];
-                add_to_view(values, of_views(place), unknowns, &row.view, own);
-                add_gradient(gradient, own, row.residual);
-                if let Some(((_, free, _), cross)) = group.zip(cross) {
-                    add_product(values, of_views(cross), row.by_intrinsics(free), own);
-                }
+        for (seen, row) in self.seen.iter().zip(self.rows).filter(|(seen, _)| views.contains(&seen.view)) {
+            let ViewPlaces { view: Some((first, unknowns, place)), group, cross } = self.places[seen.view] else {
+                continue;
+            };
+            let Some(row) = row else { continue };
+            let own = [&row.view[0][..unknowns], &row.view[1][..unknowns]];
+            add_to_view(values, of_views(place), unknowns, &row.view, own);
+            add_gradient(&mut gradient[first - first_unknown..], own, row.residual);
+            if let Some(((_, free, _), cross)) = group.zip(cross) {
+                add_product(values, of_views(cross), row.by_intrinsics(free), own);
             }
         }
     }
@@ -311,11 +296,10 @@ impl Batch<'_> {
     /// Adds to the blocks of all groups.
     ///
     /// * `values`, `gradient`: those of the groups
-    /// * `seen`: the observations of the batch
     #[inline(always)]
-    fn add_to_groups(&self, seen: &[Seen], values: &mut [f64], gradient: &mut [f64]) {
+    fn add_to_groups(&self, values: &mut [f64], gradient: &mut [f64]) {
         let Some(&(first_value, first_unknown)) = self.before.last() else { return };
-        for (seen, row) in seen.iter().zip(self.rows) {
+        for (seen, row) in self.seen.iter().zip(self.rows) {
             let (Some((first, free, place)), Some(row)) = (self.places[seen.view].group, row) else { continue };
             let free = row.by_intrinsics(free);
             add_product(values, Place { start: place.start - first_value, ..place }, free, free);
@@ -362,9 +346,12 @@ fn add_rows<const R: usize>(values: &mut [f64], place: Place, rows: &[[f64; VIEW
     let [first, second] = rows;
     for (k, (a, b)) in a.iter().zip(b).enumerate() {
         if let Some(slots) = values[place.start + k * place.stride..].first_chunk_mut::<R>() {
-            for ((slot, first), second) in slots.iter_mut().zip(first).zip(second) {
-                *slot += first * a + second * b;
+            // In a local copy, which the compiler knows to be none of the rows.
+            let mut sums = *slots;
+            for ((sum, first), second) in sums.iter_mut().zip(first).zip(second) {
+                *sum += first * a + second * b;
             }
+            *slots = sums;
         }
     }
 }
@@ -372,11 +359,20 @@ fn add_rows<const R: usize>(values: &mut [f64], place: Place, rows: &[[f64; VIEW
 /// Adds `rows' columns` to a block.
 #[inline(always)]
 fn add_product(values: &mut [f64], place: Place, rows: [&[f64]; 2], columns: [&[f64]; 2]) {
-    let [first, second] = rows;
+    let (first, firsts) = rows[0].as_chunks::<LANES>();
+    let (second, seconds) = rows[1].as_chunks::<LANES>();
     for (k, (a, b)) in columns[0].iter().zip(columns[1]).enumerate() {
-        let start = place.start + k * place.stride;
-        for (r, slot) in values[start..start + first.len()].iter_mut().enumerate() {
-            *slot += first[r] * a + second[r] * b;
+        let slots = &mut values[place.start + k * place.stride..][..rows[0].len()];
+        let (slots, others) = slots.as_chunks_mut::<LANES>();
+        for ((slots, first), second) in slots.iter_mut().zip(first).zip(second) {
+            let mut sums = *slots;
+            for (r, sum) in sums.iter_mut().enumerate() {
+                *sum += first[r] * a + second[r] * b;
+            }
+            *slots = sums;
+        }
+        for ((slot, first), second) in others.iter_mut().zip(firsts).zip(seconds) {
+            *slot += first * a + second * b;
         }
     }
 }

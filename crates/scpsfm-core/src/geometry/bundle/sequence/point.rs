@@ -82,10 +82,13 @@ impl PointFactor {
         let (a, rest) = whitened.split_at_mut(stride);
         let (b, c) = rest.split_at_mut(stride);
         let (a, b, c) = (&mut a[..rows], &mut b[..rows], &mut c[..rows]);
-        for k in 0..rows {
-            a[k] = coupling[k] * l00;
-            b[k] = (coupling[rows + k] - l10 * a[k]) * l11;
-            c[k] = (coupling[2 * rows + k] - l20 * a[k] - l21 * b[k]) * l22;
+        let (first, rest) = coupling.split_at(rows);
+        let (second, third) = rest.split_at(rows);
+        let written = a.iter_mut().zip(b).zip(c);
+        for (((a, b), c), ((first, second), third)) in written.zip(first.iter().zip(second).zip(third)) {
+            *a = first * l00;
+            *b = (second - l10 * *a) * l11;
+            *c = (third - l20 * *a - l21 * *b) * l22;
         }
     }
 }

@@ -9,14 +9,13 @@ use super::super::cholesky;
 use super::super::metric::{POINT, POSE};
 use super::super::panel::{self, PANEL_SHARE};
 use super::MetricReconstruction;
-use super::grouped::within;
 use super::layout::Layout;
 use super::normal::Normal;
 use super::pattern::{Column, Pattern};
 use super::solver::SparseCholesky;
-use super::worker_pool::{WorkerPool, split_off};
+use super::worker_pool::{POINTS_BETWEEN_QUESTIONS, WorkerPool, split_off};
 use crate::parallel::even_cuts;
-use crate::simd::vectorised;
+use crate::simd::{LANES, vectorised};
 
 /// Damping beside Marquardt's, as a share of the diagonal: holds the gauge (seven directions for every set of views
 /// that no point connects with another). Rounding leaves some 1e-15 of the diagonal in these directions; the weakest
@@ -30,8 +29,6 @@ pub(super) struct Reduced {
     pub values: Vec<f64>,
     /// Right-hand side, then solution.
     pub vector: Vec<f64>,
-    /// Points that are coupled with each block, ascending.
-    incident_points: Vec<Vec<u32>>,
     /// Couplings of a batch of points, each times the inverse root of its point's block: one point's after the other,
     /// or the columns of a panel.
     whitened: Vec<f64>,
@@ -54,7 +51,6 @@ impl Reduced {
             by_panels: pattern.is_square && layout.coupled_share() >= PANEL_SHARE,
             values: vec![0.0; pattern.value_count()],
             vector: vec![0.0; pattern.dimension()],
-            incident_points: layout.points_by_block(),
             whitened: Vec::new(),
             whitened_gradients: Vec::new(),
             pattern,
@@ -63,8 +59,8 @@ impl Reduced {
 
     /// Eliminates the points; `false` when a point's block cannot be factored, or it was stopped.
     ///
-    /// Batch by batch: first the points are whitened, each by itself, then every block column takes from them what they
-    /// subtract from it, in their order; by panels, one product does.
+    /// Batch by batch: first the points are whitened, each by itself, then taken from the block columns that they are
+    /// coupled with, in their order; by panels, one product does.
     pub fn build(&mut self, normal: &Normal, damping: f64, pool: &WorkerPool) -> bool {
         self.values.copy_from_slice(&normal.cameras.values);
         for (slot, gradient) in self.vector.iter_mut().zip(&normal.cameras.gradient) {
@@ -149,9 +145,11 @@ impl Reduced {
     }
 
     fn subtract(&mut self, pool: &WorkerPool, points: Range<usize>) -> bool {
-        let Self { pattern, values, vector, incident_points, whitened, whitened_gradients, .. } = self;
-        let of_batch = |block: usize| within(&incident_points[block], &points);
-        let weights = (0..pattern.block_count()).map(|block| of_batch(block).len());
+        let Self { pattern, values, vector, whitened, whitened_gradients, .. } = self;
+        let mut weights = vec![0; pattern.block_count()];
+        for incident in points.clone().flat_map(|point| pool.layout.incident_blocks(point)) {
+            weights[incident.block as usize] += 1;
+        }
         let (mut values, mut vector) = (values.as_mut_slice(), vector.as_mut_slice());
         let cut = |ends: &[usize]| {
             let range = ends[0]..ends[1];
@@ -159,17 +157,13 @@ impl Reduced {
             let unknowns = pattern.offsets[range.end] - pattern.offsets[range.start];
             Columns { vector: split_off(&mut vector, unknowns), range, values }
         };
-        let pieces = even_cuts(pool.threads.pieces(), weights).windows(2).map(cut).collect();
-        let batch = Whitened {
-            first: points.start,
-            points: pool.layout.couplings_of(points.clone()).start,
-            whitened,
-            whitened_gradients,
-        };
+        let cuts = even_cuts(pool.threads.pieces(), weights.into_iter());
+        let pieces = cuts.windows(2).map(cut).collect();
+        let batch = Whitened { points, whitened, whitened_gradients };
         pool.threads.each(pieces, |piece: Columns| {
             vectorised(
                 #[inline(always)]
-                || piece.subtract(pattern, &batch, of_batch, pool),
+                || piece.subtract(pattern, &batch, pool),
             )
         })
     }
@@ -198,50 +192,40 @@ impl Reduced {
 
 /// What the points of a batch subtract is made of.
 struct Whitened<'a> {
-    /// The first point, and where its couplings are among all.
-    first: usize,
-    points: usize,
+    points: Range<usize>,
     whitened: &'a [f64],
     whitened_gradients: &'a [Vector3<f64>],
 }
 
 impl Columns<'_> {
     /// Takes from these columns what the points that are coupled with them subtract; `false` when it was stopped.
-    ///
-    /// * `incident_points`: points of the batch that are coupled with a block, ascending
     #[inline(always)]
-    fn subtract<'t>(
-        self,
-        pattern: &Pattern,
-        batch: &Whitened,
-        incident_points: impl Fn(usize) -> &'t [u32],
-        pool: &WorkerPool,
-    ) -> bool {
+    fn subtract(self, pattern: &Pattern, batch: &Whitened, pool: &WorkerPool) -> bool {
         let layout = pool.layout;
+        let first_coupling = layout.couplings_of(batch.points.clone()).start;
         let (first_value, first_unknown) =
             (pattern.panels(self.range.clone()).start, pattern.offsets[self.range.start]);
-        for column in self.range {
-            if pool.stop.is_stopped() {
+        for (point, whitened_gradient) in batch.points.clone().zip(batch.whitened_gradients) {
+            if point.is_multiple_of(POINTS_BETWEEN_QUESTIONS) && pool.stop.is_stopped() {
                 return false;
             }
-            let (size, stride) = (pattern.size(column), pattern.stride(column));
-            let vector = &mut self.vector[pattern.offsets[column] - first_unknown..][..size];
-            for point in incident_points(column).iter().map(|&point| point as usize) {
-                let incident_blocks = layout.incident_blocks(point);
-                let Ok(first) = incident_blocks.binary_search_by_key(&(column as u32), |incident| incident.block)
-                else {
-                    continue;
-                };
-                let whitened = &batch.whitened[layout.couplings(point).start - batch.points..];
-                let right = &whitened[incident_blocks[first].coupling as usize..][..POINT * size];
-                let whitened_gradient = &batch.whitened_gradients[point - batch.first];
-                for (k, slot) in vector.iter_mut().enumerate() {
-                    *slot += right[k] * whitened_gradient[0]
-                        + right[size + k] * whitened_gradient[1]
-                        + right[2 * size + k] * whitened_gradient[2];
+            let incident_blocks = layout.incident_blocks(point);
+            let whitened = &batch.whitened[layout.couplings(point).start - first_coupling..];
+            let first = incident_blocks.partition_point(|incident| (incident.block as usize) < self.range.start);
+            for (k, column) in incident_blocks.iter().enumerate().skip(first) {
+                let block = column.block as usize;
+                if block >= self.range.end {
+                    break;
                 }
-                let places: Column = pattern.column(column);
-                for row in &incident_blocks[first..] {
+                let (size, stride) = (pattern.size(block), pattern.stride(block));
+                let right = factor_columns(&whitened[column.coupling as usize..][..POINT * size]);
+                let [x, y, z]: &[f64; POINT] = whitened_gradient.as_ref();
+                let vector = &mut self.vector[pattern.offsets[block] - first_unknown..][..size];
+                for (((slot, a), b), c) in vector.iter_mut().zip(right[0]).zip(right[1]).zip(right[2]) {
+                    *slot += a * x + b * y + c * z;
+                }
+                let places: Column = pattern.column(block);
+                for row in &incident_blocks[k..] {
                     // Pattern and incident blocks come from the same layout, so that there is a place.
                     let Some(start) = places.start_of(row.block) else { continue };
                     let height = pattern.size(row.block as usize);
@@ -249,13 +233,21 @@ impl Columns<'_> {
                     let values = &mut self.values[start - first_value..];
                     match left.first_chunk::<{ POINT * POSE }>() {
                         Some(left) if height == POSE => subtract_from_pose(values, stride, left, right),
-                        _ => subtract_product(values, stride, left, right),
+                        _ => subtract_product(values, stride, factor_columns(left), right),
                     }
                 }
             }
         }
         true
     }
+}
+
+/// The three columns of a factor.
+#[inline(always)]
+fn factor_columns(factor: &[f64]) -> [&[f64]; POINT] {
+    let (first, rest) = factor.split_at(factor.len() / POINT);
+    let (second, third) = rest.split_at(first.len());
+    [first, second, third]
 }
 
 /// Moves the points of `moved` to where they belong after the step of poses and intrinsics: from where they are in
@@ -297,10 +289,8 @@ fn dot(a: &[f64], b: &[f64]) -> f64 {
 
 /// Subtracts `left right'` from a block of six rows; both factors have three columns.
 #[inline(always)]
-fn subtract_from_pose(values: &mut [f64], stride: usize, left: &[f64; POINT * POSE], right: &[f64]) {
-    let columns = right.len() / POINT;
-    for k in 0..columns {
-        let (a, b, c) = (right[k], right[columns + k], right[2 * columns + k]);
+fn subtract_from_pose(values: &mut [f64], stride: usize, left: &[f64; POINT * POSE], right: [&[f64]; POINT]) {
+    for (k, ((a, b), c)) in right[0].iter().zip(right[1]).zip(right[2]).enumerate() {
         if let Some(slots) = values[k * stride..].first_chunk_mut::<POSE>() {
             for (r, slot) in slots.iter_mut().enumerate() {
                 *slot -= left[r] * a + left[POSE + r] * b + left[2 * POSE + r] * c;
@@ -311,12 +301,22 @@ fn subtract_from_pose(values: &mut [f64], stride: usize, left: &[f64; POINT * PO
 
 /// Subtracts `left right'` from a block.
 #[inline(always)]
-fn subtract_product(values: &mut [f64], stride: usize, left: &[f64], right: &[f64]) {
-    let (rows, columns) = (left.len() / POINT, right.len() / POINT);
-    for k in 0..columns {
-        let (a, b, c) = (right[k], right[columns + k], right[2 * columns + k]);
-        for (r, slot) in values[k * stride..][..rows].iter_mut().enumerate() {
-            *slot -= left[r] * a + left[rows + r] * b + left[2 * rows + r] * c;
+fn subtract_product(values: &mut [f64], stride: usize, left: [&[f64]; POINT], right: [&[f64]; POINT]) {
+    let (first, firsts) = left[0].as_chunks::<LANES>();
+    let (second, seconds) = left[1].as_chunks::<LANES>();
+    let (third, thirds) = left[2].as_chunks::<LANES>();
+    for (k, ((a, b), c)) in right[0].iter().zip(right[1]).zip(right[2]).enumerate() {
+        let (slots, others) = values[k * stride..][..left[0].len()].as_chunks_mut::<LANES>();
+        for (((slots, first), second), third) in slots.iter_mut().zip(first).zip(second).zip(third) {
+            // In a local copy, which the compiler knows to be none of the factors.
+            let mut sums = *slots;
+            for (r, sum) in sums.iter_mut().enumerate() {
+                *sum -= first[r] * a + second[r] * b + third[r] * c;
+            }
+            *slots = sums;
+        }
+        for (((slot, first), second), third) in others.iter_mut().zip(firsts).zip(seconds).zip(thirds) {
+            *slot -= first * a + second * b + third * c;
         }
     }
 }

@@ -14,7 +14,7 @@ const WORTH_A_THREAD: usize = 4_096;
 pub(super) const BATCH: usize = 16_384;
 /// Points between two looks at the stop token where points are worked on one by one: tracks may be thousands of views
 /// long.
-const POINTS_BETWEEN_QUESTIONS: usize = 16;
+pub(super) const POINTS_BETWEEN_QUESTIONS: usize = 16;
 
 /// The threads of an adjustment, and the cuts of its points.
 pub(super) struct WorkerPool<'a> {
