@@ -72,11 +72,6 @@ scpsfm_core::named! {
 }
 
 impl JobState {
-    /// The state of that name.
-    pub fn from_name(name: &str) -> Option<Self> {
-        Self::ALL.into_iter().find(|state| state.name() == name)
-    }
-
     /// Whether the job has ended: it changes no more, unless it is retried.
     pub fn is_terminal(self) -> bool {
         !matches!(self, JobState::Queued | JobState::Running)
@@ -174,13 +169,6 @@ scpsfm_core::named! {
         GivenBack = "GIVEN_BACK",
         /// Its server was not heard of for the time of a lease, or its process died.
         Lost = "LOST",
-    }
-}
-
-impl AttemptEnd {
-    /// The end of that name.
-    pub fn from_name(name: &str) -> Option<Self> {
-        Self::ALL.into_iter().find(|end| end.name() == name)
     }
 }
 

@@ -13,6 +13,6 @@ pub use quota::{Oversize, Quota};
 pub use scpsfm_core::domain::*;
 pub use webhook::{Webhook, WebhookState};
 
-/// Observations of an input that is checked, encoded, hashed and read where that is asked for: some 40 kB, which take
-/// less time than to wake another thread does.
+/// Inputs of at most so many observations are checked, encoded, hashed and read on the thread that has them: it takes
+/// less time than to wake another one.
 pub const FEW_OBSERVATIONS: u32 = 2_000;

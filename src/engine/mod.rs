@@ -245,7 +245,7 @@ impl Engine {
         &self.inner.options
     }
 
-    /// The encoded result of a job, which had succeeded when it was read.
+    /// The encoded result of a job, as it was read before: it must have succeeded then.
     ///
     /// # Errors
     /// [`StoreError::NotFound`], [`Error::NotReady`] for a job in any other state, [`StoreError::Corrupt`] for a result

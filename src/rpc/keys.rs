@@ -58,12 +58,6 @@ scpsfm_core::named! {
     }
 }
 
-impl Scope {
-    fn from_name(name: &str) -> Option<Self> {
-        Self::ALL.into_iter().find(|scope| scope.name() == name)
-    }
-}
-
 /// What a key stands for.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Grant {

@@ -45,6 +45,11 @@ macro_rules! named {
                     $(Self::$value => $name,)*
                 }
             }
+
+            /// The value of that name.
+            pub fn from_name(name: &str) -> Option<Self> {
+                Self::ALL.into_iter().find(|value| value.name() == name)
+            }
         }
     };
 }

@@ -127,7 +127,8 @@ fn open(path: &Path) -> Result<Connection, Problem> {
     // SQLite's own words for a file that is not there name the address.
     std::fs::File::open(path).map_err(|error| failed(&error))?;
     let absolute = std::path::absolute(path).map_err(|error| failed(&error))?;
-    let mut address = url::Url::from_file_path(absolute).map_err(|()| failed(&"its path is none of a file"))?;
+    let mut address =
+        url::Url::from_file_path(absolute).map_err(|()| failed(&"its path cannot be written as a URL"))?;
     address.set_query(Some("immutable=1"));
     let flags = OpenFlags::SQLITE_OPEN_READ_ONLY | OpenFlags::SQLITE_OPEN_URI | OpenFlags::SQLITE_OPEN_NO_MUTEX;
     let connection = Connection::open_with_flags(address.as_str(), flags).map_err(|error| failed(&error))?;

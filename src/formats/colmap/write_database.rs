@@ -111,7 +111,7 @@ fn open(path: &Path) -> rusqlite::Result<Connection> {
 }
 
 fn failed(error: rusqlite::Error) -> Problem {
-    Problem::of_file(format!("cannot be changed: {error}"))
+    Problem::of_file(format!("cannot be changed: {}", rows::cause(error)))
 }
 
 /// COLMAP's number of a pair.

@@ -45,7 +45,10 @@ pub(in crate::store) async fn a_created_job_reads_back(store: &Store) {
     };
     assert_eq!(created.job, expected);
     assert_eq!(store.job(&new.name).await, Ok(expected));
-    assert_eq!(store.job_payload(&new.name, u32::MAX).await.map(|payload| payload.input), Ok(input));
+    for observations in [0, u32::MAX] {
+        let read = store.job_payload(&new.name, observations).await.map(|payload| payload.input);
+        assert_eq!(read.as_ref(), Ok(&input), "however large it is said to be");
+    }
     assert_eq!(result_of(store, &new.name).await, Ok(None));
     assert_eq!(story(store, &new.name).await, told(&[(1, 0, "QUEUED")]));
     let claimed = claim(store, 1).await;

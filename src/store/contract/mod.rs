@@ -243,6 +243,7 @@ fn success(result: Vec<u8>) -> Arc<Ending> {
 /// The bytes of a job's result, which must be those that were stored.
 async fn result_of(store: &Store, name: &JobName) -> Result<Option<Vec<u8>>, Error> {
     let result = store.result(name, u32::MAX).await?;
+    assert_eq!(store.result(name, 0).await.as_ref(), Ok(&result), "however large it is said to be");
     assert!(result.as_ref().is_none_or(EncodedResult::is_intact));
     Ok(result.map(|result| result.bytes))
 }

@@ -8,7 +8,7 @@ use sqlx::postgres::{PgConnection, PgRow};
 use sqlx::{AssertSqlSafe, Column, Row as _, SqlSafeStr, TypeInfo, ValueRef};
 
 use super::listener;
-use crate::store::sql::{self, Connection, Lock, Row, Statement, Value};
+use crate::store::sql::{Connection, Lock, Row, Statement, Value};
 use crate::store::{Error, Notification};
 
 /// Key of the advisory lock under which jobs are admitted: any constant does that others do not use, `scpsfm` in ASCII.
@@ -74,7 +74,7 @@ fn cell(row: &PgRow, place: usize) -> Result<Value, Error> {
     }
 }
 
-/// One that is read through, outside a transaction.
+/// One of the pool.
 #[async_trait::async_trait]
 impl Connection for PoolConnection<sqlx::Postgres> {
     fn writes_alone(&self) -> bool {
@@ -84,23 +84,50 @@ impl Connection for PoolConnection<sqlx::Postgres> {
     async fn rows(&mut self, statement: Statement) -> Result<Vec<Row>, Error> {
         (**self).rows(statement).await
     }
+
+    async fn take_lock(&mut self, lock: Lock) -> Result<(), Error> {
+        (**self).take_lock(lock).await
+    }
+
+    async fn notify(&mut self, notification: Notification) -> Result<(), Error> {
+        (**self).notify(notification).await
+    }
 }
 
-/// Whether the database refused for a reason that waiting does not mend: SQLSTATE classes 22 (data), 23 (integrity) and
-/// 42 (syntax or access).
-fn is_defect(code: &str) -> bool {
-    ["22", "23", "42"].iter().any(|class| code.starts_with(class))
+/// What an SQLSTATE says (PostgreSQL, appendix A): `disk_full`; damaged files or indices; and what waiting does not
+/// mend, by its class: data (22), integrity (23), syntax or access (42).
+fn of_code(code: &str) -> fn(String) -> Error {
+    match code {
+        "53100" => Error::NoSpace,
+        "XX001" | "XX002" => Error::Corrupt,
+        _ if ["22", "23", "42"].iter().any(|class| code.starts_with(class)) => Error::Corrupt,
+        _ => Error::Unavailable,
+    }
 }
 
 impl From<sqlx::Error> for Error {
     fn from(error: sqlx::Error) -> Self {
-        let code = error.as_database_error().and_then(|cause| cause.code()).unwrap_or_default();
-        sql::by_code(&code, error.to_string()).unwrap_or_else(|text| match &error {
+        let text = error.to_string();
+        match error {
+            sqlx::Error::Database(cause) => of_code(&cause.code().unwrap_or_default())(text),
             sqlx::Error::ColumnDecode { .. } | sqlx::Error::ColumnNotFound(_) | sqlx::Error::Decode(_) => {
-                Error::Corrupt(text)
+                Self::Corrupt(text)
             }
-            sqlx::Error::Database(_) if is_defect(&code) => Error::Corrupt(text),
-            _ => Error::Unavailable(text),
-        })
+            _ => Self::Unavailable(text),
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn codes_tell_a_full_disk_and_a_damaged_file() {
+        let of = |code| of_code(code)(String::new());
+        assert!(matches!(of("53100"), Error::NoSpace(_)));
+        assert!(["XX001", "23505", "42P01"].map(of).iter().all(|error| matches!(error, Error::Corrupt(_))));
+        // Too many connections, a serialization failure; no code at all.
+        assert!(["53300", "40001", ""].map(of).iter().all(|error| matches!(error, Error::Unavailable(_))));
     }
 }

@@ -36,7 +36,7 @@ pub(super) async fn measured<T>(
     result
 }
 
-/// Reads through a connection of its own; measured where the operation is named. `return` leaves the operation: its body
+/// Reads outside a transaction; measured where the operation is named. `return` leaves the operation: its body
 /// is an asynchronous block.
 macro_rules! reads {
     ($database:expr, $operation:literal, $size:expr, |$connection:ident| $body:expr) => {
@@ -105,7 +105,7 @@ pub(super) use writes;
 impl dyn Database {
     /// Whether a look finds what an operation is for: it spares the writer, and the disk, a transaction.
     pub(super) async fn finds(&self, select: Statement) -> Result<bool, Error> {
-        reads!(self, Size::Small, |connection| connection.row(select).await?.flag("found"))
+        reads!(self, Size::Page, |connection| connection.row(select).await?.flag("found"))
     }
 
     /// Closes every connection; what was acknowledged is durable without it.

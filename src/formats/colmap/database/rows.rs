@@ -2,7 +2,7 @@
 
 use std::collections::{BTreeSet, HashMap, HashSet};
 
-use rusqlite::types::ValueRef;
+use rusqlite::types::{Type, ValueRef};
 use rusqlite::{Connection, Row};
 
 use super::super::cameras::{Camera, Model};
@@ -27,7 +27,15 @@ pub(super) fn table(kind: Matches) -> &'static str {
 }
 
 fn damaged(error: rusqlite::Error) -> Problem {
-    Problem::of_file(format!("cannot be read as a COLMAP database: {error}"))
+    Problem::of_file(format!("cannot be read as a COLMAP database: {}", cause(error)))
+}
+
+/// What is wrong, without the query.
+pub(in super::super) fn cause(error: rusqlite::Error) -> String {
+    match error {
+        rusqlite::Error::SqlInputError { msg, .. } => msg,
+        error => error.to_string(),
+    }
 }
 
 /// Gives every row of a query to `each`.
@@ -81,8 +89,10 @@ pub(super) fn images(connection: &Connection, most: usize, images: &mut Images) 
         let id: u32 = integer(row, "images", "image_id", 0)?;
         let wrong = |what: String| Problem::of_record(format!("table images, row {id}"), what);
         let camera = integer(row, "images", "camera_id", id.into())?;
-        let name = cell(row, "images", "name", id.into())?;
-        let name = name.as_str().map_err(|error| wrong(format!("name: {error}")))?;
+        let name = match cell(row, "images", "name", id.into())? {
+            ValueRef::Text(text) => str::from_utf8(text).map_err(|error| wrong(format!("name: {error}")))?,
+            other => return Err(other_type("images", "name", id.into(), other, Type::Text)),
+        };
         images.add_image(id, name, camera).map_err(wrong)?;
         if images.len() > most { Err(wrong(format!("more images than the limit of {most}"))) } else { Ok(()) }
     })
@@ -219,8 +229,16 @@ fn pair(row: &[u8]) -> [[u8; 4]; 2] {
 
 /// What a row has in a column. `id` names the row in errors.
 fn cell<'r>(row: &'r Row<'_>, table: &str, column: &str, id: u64) -> Result<ValueRef<'r>, Problem> {
-    row.get_ref(column)
-        .map_err(|error| Problem::of_record(format!("table {table}, row {id}: {column}"), error.to_string()))
+    row.get_ref(column).map_err(|error| Problem::of_record(place(table, column, id), error.to_string()))
+}
+
+fn place(table: &str, column: &str, id: u64) -> String {
+    format!("table {table}, row {id}: {column}")
+}
+
+/// A column that holds something else than it should.
+fn other_type(table: &str, column: &str, id: u64, found: ValueRef<'_>, expected: Type) -> Problem {
+    Problem::of_record(place(table, column, id), format!("is of the type {}, not {expected}", found.data_type()))
 }
 
 /// An integer of a row.
@@ -230,10 +248,10 @@ pub(in super::super) fn integer<T: TryFrom<i64>>(
     column: &str,
     id: u64,
 ) -> Result<T, Problem> {
-    let wrong = |what: String| Problem::of_record(format!("table {table}, row {id}: {column}"), what);
     match cell(row, table, column, id)? {
-        ValueRef::Integer(value) => T::try_from(value).map_err(|_| wrong(format!("{value} is out of range"))),
-        other => Err(wrong(format!("is of the type {}, not Integer", other.data_type()))),
+        ValueRef::Integer(value) => T::try_from(value)
+            .map_err(|_| Problem::of_record(place(table, column, id), format!("{value} is out of range"))),
+        other => Err(other_type(table, column, id, other, Type::Integer)),
     }
 }
 
@@ -242,10 +260,7 @@ fn blob<'r>(row: &'r Row<'_>, table: &str, column: &str, id: u64) -> Result<&'r 
     match cell(row, table, column, id)? {
         ValueRef::Blob(bytes) => Ok(bytes),
         ValueRef::Null => Ok(&[]),
-        other => {
-            let place = format!("table {table}, row {id}: {column}");
-            Err(Problem::of_record(place, format!("is of the type {}, not Blob", other.data_type())))
-        }
+        other => Err(other_type(table, column, id, other, Type::Blob)),
     }
 }
 
