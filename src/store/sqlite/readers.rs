@@ -94,10 +94,12 @@ impl Own {
 #[async_trait::async_trait]
 impl Connection for Reader {
     async fn rows(&mut self, statement: Statement) -> Result<Vec<Row>, Error> {
-        if self.is_small
-            && let Some(rows) = self.readers.read_here(&statement)
-        {
-            return rows;
+        if self.is_small {
+            // Who reads again and again, never waiting, leaves the thread to others now and then.
+            tokio::task::consume_budget().await;
+            if let Some(rows) = self.readers.read_here(&statement) {
+                return rows;
+            }
         }
         let mut own = match self.own.take() {
             Some(own) => own,

@@ -58,16 +58,16 @@ fn update(connection: &mut SqliteConnection) -> Result<(), Error> {
     let steps = sql::migrator(&MIGRATIONS);
     let transaction = connection.inner().transaction_with_behavior(TransactionBehavior::Immediate)?;
     transaction.execute_batch(STEPS_TABLE)?;
-    let taken: BTreeMap<i64, Vec<u8>> = transaction
-        .prepare("SELECT version, checksum FROM _sqlx_migrations")?
-        .query_map([], |row| Ok((row.get(0)?, row.get(1)?)))?
-        .collect::<Result<_, _>>()?;
+    // Without a checksum: a step that was begun and not done.
+    let select = "SELECT version, CASE WHEN success THEN CAST(checksum AS BLOB) END FROM _sqlx_migrations";
+    let taken: BTreeMap<i64, Option<Vec<u8>>> =
+        transaction.prepare(select)?.query_map([], |row| Ok((row.get(0)?, row.get(1)?)))?.collect::<Result<_, _>>()?;
     if let Some(&unknown) = taken.keys().find(|&&version| !steps.version_exists(version)) {
         return Err(sql::other_version(unknown));
     }
     for step in steps.iter() {
         match taken.get(&step.version) {
-            Some(checksum) if *checksum == *step.checksum => {}
+            Some(Some(checksum)) if *checksum == *step.checksum => {}
             Some(_) => return Err(sql::other_version(step.version)),
             None => {
                 transaction.execute_batch(step.sql.as_str())?;

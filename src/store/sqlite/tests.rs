@@ -157,7 +157,9 @@ async fn a_database_of_another_version_is_refused() {
     let newer = "INSERT INTO _sqlx_migrations (version, description, success, checksum, execution_time) \
                  VALUES (9999, 'from the future', 1, x'00', 0)";
     let older = "UPDATE _sqlx_migrations SET checksum = x'00'";
-    for (statement, step) in [(newer, "step 9999"), (older, "step 1")] {
+    let odd = "UPDATE _sqlx_migrations SET checksum = 'text'";
+    let half = "UPDATE _sqlx_migrations SET success = FALSE";
+    for (statement, step) in [(newer, "step 9999"), (older, "step 1"), (odd, "step 1"), (half, "step 1")] {
         let directory = tempfile::tempdir().expect("a temporary directory");
         let store = Sqlite::open(directory.path()).expect("opens");
         store.execute(statement).await;

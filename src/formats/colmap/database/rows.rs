@@ -258,7 +258,8 @@ pub(in super::super) fn integer<T: TryFrom<i64>>(
 /// A blob of a row; NULL is an empty one.
 fn blob<'r>(row: &'r Row<'_>, table: &str, column: &str, id: u64) -> Result<&'r [u8], Problem> {
     match cell(row, table, column, id)? {
-        ValueRef::Blob(bytes) => Ok(bytes),
+        // SQLite keeps what it is given: bytes may be there as text.
+        ValueRef::Blob(bytes) | ValueRef::Text(bytes) => Ok(bytes),
         ValueRef::Null => Ok(&[]),
         other => Err(other_type(table, column, id, other, Type::Blob)),
     }
