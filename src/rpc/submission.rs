@@ -103,8 +103,14 @@ impl Submission {
                     let _permit = permit;
                     draft.finish()
                 };
-                // Sorting millions of observations takes a second: not on a thread that serves others.
-                let checked = if is_small { finish() } else { super::blocking(finish).await? };
+                let checked = if is_small {
+                    // A batch has a thousand of these: others have their turn now and then.
+                    tokio::task::consume_budget().await;
+                    finish()
+                } else {
+                    // Sorting millions of observations takes a second: not on a thread that serves others.
+                    super::blocking(finish).await?
+                };
                 JobInput::Inline(checked.map_err(invalid)?)
             }
         };

@@ -9,7 +9,7 @@ use crate::parallel::{Threads, even_cuts};
 
 /// Observations from which a second thread is worth its beginning: their linearisation takes a millisecond.
 const WORTH_A_THREAD: usize = 4_096;
-/// Observations of a batch: bounds the rows of the Jacobian that are held at once, 270 bytes each, to some 4 MB, and
+/// Observations of a batch: bounds the rows of the Jacobian that are held at once, 328 bytes each, to some 5 MB, and
 /// the time between two looks at the stop token to some milliseconds, 20 in builds for tests.
 pub(super) const BATCH: usize = 16_384;
 /// Points between two looks at the stop token where points are worked on one by one: tracks may be thousands of views
