@@ -127,7 +127,10 @@ fn solve_views(
     let mut recorder = Recorder::new(observer, problem.observed_views().len());
     let ended = match problem.is_searched() {
         true => sequence::solve(&mut problem, &mut recorder)?,
-        false => Ended::Block(attempt::solve_densest(&problem, &mut recorder)?.map(Box::new)),
+        false => {
+            let found = attempt::solve_densest(&problem, &mut recorder)?;
+            found.map_or(Ended::Block(None), |attempt| Ended::of_block(&problem, attempt))
+        }
     };
     problem.stopped()?;
     let solution = assemble::solution(ended, &problem, recorder)?;

@@ -27,6 +27,7 @@ use crate::geometry::bundle::{Options, projective};
 use crate::geometry::daq::to_canonical_frame;
 use crate::geometry::observation::{self, Observation};
 use crate::geometry::planar;
+use crate::geometry::statistics::root_mean_square;
 
 use super::error::Error;
 use critical::Upgrade;
@@ -156,6 +157,33 @@ impl Outcome {
             self.warnings.push(grades.unobservable(Some(sigma)));
         }
         self.grade = self.grade.worse(worth);
+    }
+
+    /// Raises the standard deviation of a calibration whose principal point and aspect are implausible, and says so.
+    ///
+    /// Wrong observations may fit such a camera, and determine it well. What is known of cameras and what the
+    /// observations say contradict each other then, and sigma grows by Birge's ratio, as where the caller's prior does
+    /// that: cropped images whose calibration is well determined keep it. Asked twice, it grows once.
+    ///
+    /// * `found`: intrinsics of the group
+    pub fn doubt_implausible(&mut self, found: &Intrinsics, options: &CalibrationOptions, scale_px: f64) {
+        let deviations = options.lenses.deviations(self.model, found);
+        let calibrated = self.sigma_log_focal.filter(|_| self.grade != Grade::ProjectiveOnly);
+        let (Some(sigma), Some(ratio)) = (calibrated, root_mean_square(&deviations)) else { return };
+        if deviations.len() as f64 * ratio.powi(2) <= options.models.significant_gain(deviations.len()) {
+            return;
+        }
+        let detail = format!(
+            "the camera that fits best has its principal point {:.0} px from where it is expected and pixels of aspect \
+             {:.3}, {ratio:.1} times as far off as is usual; sigma is as much larger",
+            found.principal_point.norm() * scale_px,
+            found.aspect
+        );
+        let warning = Warning::new(WarningCode::ModelMismatch, detail);
+        if !self.warnings.contains(&warning) {
+            self.warnings.push(warning);
+            self.raise_sigma(ratio * sigma, &options.grades);
+        }
     }
 
     /// An outcome without a calibration, for these reasons.

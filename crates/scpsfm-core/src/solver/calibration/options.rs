@@ -5,7 +5,7 @@
 
 use crate::domain::{FocalPrior, Grade, Warning, WarningCode};
 use crate::geometry::bundle;
-use crate::geometry::bundle::metric::{Extension, IntrinsicsModel, IntrinsicsPrior, Parameter};
+use crate::geometry::bundle::metric::{Extension, Intrinsics, IntrinsicsModel, IntrinsicsPrior, Parameter};
 use crate::geometry::statistics::{CHI_SQUARE_OF_ONE, CHI_SQUARE_OF_TWO, GATE_QUANTILE, chi_square_quantile};
 use crate::solver::consensus::LEAST_INLIERS;
 
@@ -251,6 +251,21 @@ impl LensOptions {
             Extension::RadialK3 | Extension::Tangential => self.unlikely,
             Extension::Aspect => self.rare,
         }
+    }
+
+    /// By how many standard deviations principal point and aspect are off where cameras have them, of what the model
+    /// frees.
+    ///
+    /// Terms of distortion are not counted: long lenses have large ones, in units of their focal length.
+    pub fn deviations(&self, model: IntrinsicsModel, found: &Intrinsics) -> Vec<f64> {
+        let mut deviations = Vec::new();
+        if model.contains(Extension::PrincipalPoint) {
+            deviations.extend(found.principal_point.iter().map(|at| at / self.principal_point_sigma));
+        }
+        if model.contains(Extension::Aspect) {
+            deviations.push(found.aspect.ln() / self.log_aspect_sigma);
+        }
+        deviations
     }
 
     /// Whether there is a lens of this focal length.

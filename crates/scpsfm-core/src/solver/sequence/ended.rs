@@ -19,6 +19,12 @@ pub enum Ended {
 }
 
 impl Ended {
+    /// A block as the answer.
+    pub fn of_block(problem: &Problem, mut attempt: Attempt) -> Self {
+        doubt(problem, &mut attempt);
+        Self::Block(Some(Box::new(attempt)))
+    }
+
     /// Whether there is a reconstruction without a calibration of most views, which a lens may be missing from.
     pub fn asks_for_lens(&self, problem: &Problem) -> bool {
         if problem.input.has_depths() {
@@ -99,6 +105,15 @@ pub fn attempt_worth(attempt: &Attempt, problem: &Problem) -> f64 {
     worth(attempt.evidence(problem), attempt.is_calibrated())
 }
 
+/// See [`Outcome::doubt_implausible`](crate::solver::calibration::Outcome::doubt_implausible).
+fn doubt(problem: &Problem, attempt: &mut Attempt) {
+    if let Some(outcome) = &mut attempt.calibration
+        && let Some(intrinsics) = outcome.intrinsics()
+    {
+        outcome.doubt_implausible(&intrinsics, &problem.calibration_options, problem.scale_px);
+    }
+}
+
 /// Extends an attempt metrically where it has a metric reconstruction and that stands.
 ///
 /// An attempt without a calibration has the focal length that happens to fit best, which other views may refute: its
@@ -106,12 +121,12 @@ pub fn attempt_worth(attempt: &Attempt, problem: &Problem) -> f64 {
 /// outweigh does not stand, whatever it says of the calibration.
 pub fn metric_of(problem: &Problem, attempt: Attempt, recorder: &mut Recorder) -> Result<Ended, Error> {
     if !attempt.has_metric() || attempt.is_beyond_image_points() {
-        return Ok(Ended::Block(Some(Box::new(attempt))));
+        return Ok(Ended::of_block(problem, attempt));
     }
     let was_calibrated = attempt.is_calibrated();
     let mut extended = extend(problem, attempt, recorder)?;
     if extended.seed.outweighs(&extended.model.registered(), extended.model.noise) {
-        return Ok(Ended::Block(Some(Box::new(extended.seed))));
+        return Ok(Ended::of_block(problem, extended.seed));
     }
     let explains_more = || extended.evidence(problem) > extended.seed.evidence(problem);
     // One that takes a calibration back stands in any case: the seed would go on giving it.
@@ -119,7 +134,7 @@ pub fn metric_of(problem: &Problem, attempt: Attempt, recorder: &mut Recorder) -
         extended.seed.verified_by_image_points();
         Ok(Ended::Extended(Box::new(extended)))
     } else {
-        Ok(Ended::Block(Some(Box::new(extended.seed))))
+        Ok(Ended::of_block(problem, extended.seed))
     }
 }
 
@@ -131,6 +146,9 @@ pub fn finished(problem: &Problem, mut attempt: Attempt, recorder: &mut Recorder
     let is_done = is_whole && is_one_pinhole && !problem.input.has_sigmas();
     if !attempt.judges_observations() {
         return Ok(Ended::Block(Some(Box::new(attempt))));
+    }
+    if is_done {
+        doubt(problem, &mut attempt);
     }
     if let Some(found) = Reconstruction::of_attempt(problem, &attempt).filter(|_| is_done) {
         recorder.enter(Stage::Classify);

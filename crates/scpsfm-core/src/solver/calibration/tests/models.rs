@@ -27,6 +27,30 @@ fn a_displaced_principal_point_is_found_and_a_central_one_is_left_alone() {
     }
 }
 
+/// Sigma grows by what a camera is unlike others, so that only one that is well determined is METRIC.
+#[test]
+fn an_implausible_camera_is_less_certain() {
+    for seed in 0..4 {
+        // Of as many standard deviations in y and none in x.
+        for (deviations, noise, is_metric) in [(2.0, 1e-4, true), (10.0, 1e-4, true), (10.0, 1e-2, false)] {
+            let mut scene = testing::scene(seed, 10, 60, 0.0);
+            let options = CalibrationOptions::DEFAULT;
+            scene.intrinsics.principal_point.y = deviations * options.lenses.principal_point_sigma;
+            scene.observe(noise, &mut rand::SeedableRng::seed_from_u64(seed));
+            let before = calibrated(&scene, seed, noise);
+            let mut after = before.clone();
+            // Asked twice, it doubts once.
+            (0..2).for_each(|_| after.doubt_implausible(&before.intrinsics().expect("metric"), &options, SIDE_PX));
+            let ratio = after.sigma_log_focal.expect("determined") / before.sigma_log_focal.expect("determined");
+            println!("seed {seed}, {deviations} at {noise}: {ratio}, {:?}, {:?}", after.grade, codes(&after));
+            assert_eq!((before.grade, after.grade == Grade::Metric), (Grade::Metric, is_metric), "seed {seed}");
+            let expected = if deviations > 3.0 { deviations * 0.5f64.sqrt() } else { 1.0 };
+            assert!((ratio / expected - 1.0).abs() < 0.1, "seed {seed}: {ratio} for {expected}");
+            assert_eq!(codes(&after).contains(&"MODEL_MISMATCH"), expected > 1.0, "seed {seed}");
+        }
+    }
+}
+
 /// Scenes seen through a distorting lens, only what falls into the image.
 fn through_a_lens(seed: u64, radial: f64, principal_point: Vector2<f64>, noise: f64) -> TestScene {
     let mut scene = testing::scene(seed, 10, 80, 0.0);
