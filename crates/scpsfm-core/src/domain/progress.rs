@@ -3,10 +3,11 @@
 use serde::{Deserialize, Serialize};
 
 /// Part of the solver that is running.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Serialize, Deserialize)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Default, Serialize, Deserialize)]
 #[serde(rename_all = "SCREAMING_SNAKE_CASE")]
 pub enum Stage {
     /// Normalising, choosing the block of views, balancing the measurement matrix.
+    #[default]
     Prepare,
     /// The network and the other priors propose, guided search verifies.
     Search,
@@ -154,7 +155,7 @@ pub struct ReconstructionProgress {
 }
 
 /// The state of a running optimisation.
-#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+#[derive(Debug, Clone, Copy, PartialEq, Default, Serialize, Deserialize)]
 pub struct Progress {
     pub stage: Stage,
     /// Share of the work done, 0 to 1, never decreasing within an attempt.

@@ -102,20 +102,6 @@ impl Fundamental {
         (squared > LEAST_SQUARED_SINE * to.norm_squared() && ratio.is_finite()).then_some(ratio)
     }
 
-    /// The matrix refitted to weighted matches, each weighted besides so that its algebraic error is its Sampson
-    /// distance under this matrix.
-    ///
-    /// * `weights`: one a match, not negative
-    ///
-    /// Returns `None` where fewer than [`LEAST_MATCHES`] have a weight, or as [`eight_point`] does.
-    fn refitted(&self, matches: &[Match], weights: &[f64]) -> Option<Self> {
-        let weigh =
-            |(seen, &weight): (&Match, &f64)| if weight > 0.0 { weight / algebraic(&self.matrix, seen).1 } else { 0.0 };
-        let weights: Vec<f64> = matches.iter().zip(weights).map(weigh).collect();
-        let weighted = weights.iter().filter(|&&weight| weight > 0.0).count();
-        (weighted >= LEAST_MATCHES).then(|| eight_point(matches, &weights)).flatten()
-    }
-
     /// Whether all of some matches lie on the same side of both cameras (Chum, Werner & Matas 2004): a sample with
     /// outliers rarely does, and one look spares scoring it.
     fn is_oriented(&self, sample: &[Match]) -> bool {
@@ -188,11 +174,10 @@ pub(crate) fn robust(
     ransac::estimate(&matches, squared_gate(noise), None, 0, MOST_SAMPLES, rng, stop)
 }
 
-impl Estimator for &[Match] {
+impl Estimator<0> for &[Match] {
     type Model = Fundamental;
 
     const SAMPLE: usize = LEAST_MATCHES;
-    const SAMPLE_GATES: f64 = 4.0;
 
     fn len(&self) -> usize {
         <[Match]>::len(self)
@@ -207,10 +192,16 @@ impl Estimator for &[Match] {
         fundamental.sampson_squared(&self[datum])
     }
 
+    /// Refitted to the matches within the gate, each weighted so that its algebraic error is its Sampson distance under
+    /// the matrix before.
     fn refined(&self, fundamental: &Fundamental, gate: f64) -> Option<Fundamental> {
-        (0..REFITS).try_fold(*fundamental, |fundamental, _| {
-            let within = |seen: &Match| f64::from(u8::from(fundamental.sampson_squared(seen) < gate));
-            fundamental.refitted(self, &self.iter().map(within).collect::<Vec<f64>>())
+        (0..REFITS).try_fold(*fundamental, |found, _| {
+            let weigh = |seen: &Match| {
+                if found.sampson_squared(seen) < gate { algebraic(&found.matrix, seen).1.recip() } else { 0.0 }
+            };
+            let weights: Vec<f64> = self.iter().map(weigh).collect();
+            let weighted = weights.iter().filter(|&&weight| weight > 0.0).count();
+            (weighted >= LEAST_MATCHES).then(|| eight_point(self, &weights)).flatten()
         })
     }
 }

@@ -33,6 +33,15 @@ impl Observation {
     }
 }
 
+/// A point that is known, and where a camera sees it.
+#[derive(Debug, Clone, Copy)]
+pub struct Correspondence<P> {
+    pub point: P,
+    pub xy: Vector2<f64>,
+    /// As [`Observation::weight`].
+    pub weight: f64,
+}
+
 /// How many of so many points have an observation.
 pub fn observed_points(observations: &[Observation], points: usize) -> usize {
     let mut seen = vec![false; points];

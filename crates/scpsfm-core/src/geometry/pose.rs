@@ -4,8 +4,9 @@ use nalgebra::{Matrix4, RowVector4, SVector, Schur, Vector2, Vector3};
 use rand_chacha::ChaCha8Rng;
 
 use super::bundle::metric::{Intrinsics, Pose, Projection};
+use super::observation::Correspondence;
 use super::procrustes;
-use super::ransac::{self, Estimator, Refinable, RobustModel};
+use super::ransac::{self, Estimator, RobustModel};
 use crate::domain::StopToken;
 
 /// Correspondences that determine a pose up to four solutions.
@@ -74,55 +75,36 @@ fn positive_roots(quartic: &[f64; 5]) -> Vec<f64> {
     real.map(|root| polish(root.re)).filter(|root| *root > 0.0).collect()
 }
 
-/// Points in the world and where a calibrated camera sees them, as many of each.
-#[derive(Clone, Copy)]
-pub(crate) struct Correspondences<'a> {
-    /// Of a camera at the origin, directions of any length.
-    pub points: &'a [Vector3<f64>],
-    /// Images `(u, v)` at unit depth, distortion undone.
-    pub seen: &'a [Vector2<f64>],
-    /// Of the squared distances, see [`Observation::weight`](super::observation::Observation::weight).
-    pub weights: &'a [f64],
-}
-
 /// The pose that most correspondences agree with, refined on those that do; an inlier is in front of the camera.
 ///
+/// * `seen`: points in the world, and their images `(u, v)` at unit depth, distortion undone
 /// * `gate`: squared distance, in the same units, within which an image of weight 1 agrees
+/// * `only_turns`: of a camera at the origin, which sees directions of any length: its pose has no translation
 /// * `inliers_to_beat`: as of [`ransac::estimate`]
 ///
-/// Returns `None` for fewer than three correspondences or when no sample gives a pose.
+/// Returns `None` for fewer than three correspondences, two of a camera that only turns, or when no sample gives a
+/// pose.
 pub(crate) fn robust(
-    seen: &Correspondences,
+    seen: &[Correspondence<Vector3<f64>>],
     gate: f64,
+    only_turns: bool,
     inliers_to_beat: usize,
     rng: &mut ChaCha8Rng,
     stop: &StopToken,
 ) -> Option<RobustModel<Pose>> {
-    ransac::estimate(seen, gate, None, inliers_to_beat, MOST_SAMPLES, rng, stop)
-}
-
-/// The same of a camera at the origin, which sees directions: its pose has no translation.
-///
-/// Returns `None` for fewer than two correspondences or when no sample gives a rotation.
-pub(crate) fn robust_rotation(
-    seen: &Correspondences,
-    gate: f64,
-    inliers_to_beat: usize,
-    rng: &mut ChaCha8Rng,
-    stop: &StopToken,
-) -> Option<RobustModel<Pose>> {
-    ransac::estimate(&Directions(*seen), gate, None, inliers_to_beat, MOST_SAMPLES, rng, stop)
+    match only_turns {
+        true => ransac::estimate(&Directions(seen), gate, None, inliers_to_beat, MOST_SAMPLES, rng, stop),
+        false => ransac::estimate(&seen, gate, None, inliers_to_beat, MOST_SAMPLES, rng, stop),
+    }
 }
 
 /// Points at infinity, from a camera at the origin.
-#[derive(Clone, Copy)]
-struct Directions<'a>(Correspondences<'a>);
+struct Directions<'a>(&'a [Correspondence<Vector3<f64>>]);
 
-impl Estimator for Directions<'_> {
+impl Estimator<3> for Directions<'_> {
     type Model = Pose;
 
     const SAMPLE: usize = 2;
-    const SAMPLE_GATES: f64 = Correspondences::SAMPLE_GATES;
 
     fn len(&self) -> usize {
         self.0.len()
@@ -130,7 +112,7 @@ impl Estimator for Directions<'_> {
 
     fn minimal(&self, sample: &[usize]) -> impl IntoIterator<Item = Pose> {
         let onto =
-            |&datum: &usize| self.0.seen[datum].push(1.0).normalize() * self.0.points[datum].normalize().transpose();
+            |&datum: &usize| self.0[datum].xy.push(1.0).normalize() * self.0[datum].point.normalize().transpose();
         let rotation = procrustes::nearest_rotation(&sample.iter().map(onto).sum());
         rotation.map(|rotation| Pose { rotation, translation: Vector3::zeros() })
     }
@@ -139,12 +121,6 @@ impl Estimator for Directions<'_> {
         self.0.squared_residual(pose, datum)
     }
 
-    fn refined(&self, pose: &Pose, gate: f64) -> Option<Pose> {
-        Some(ransac::refined(self, pose, gate))
-    }
-}
-
-impl Refinable<3> for Directions<'_> {
     fn residual(&self, pose: &Pose, datum: usize) -> Option<(Vector2<f64>, [SVector<f64, 3>; 2], f64)> {
         let (residual, gradients, weight) = self.0.residual(pose, datum)?;
         Some((residual, gradients.map(|gradient| gradient.fixed_rows::<3>(0).into_owned()), weight))
@@ -155,38 +131,34 @@ impl Refinable<3> for Directions<'_> {
     }
 }
 
-impl Estimator for Correspondences<'_> {
+impl Estimator<6> for &[Correspondence<Vector3<f64>>] {
     type Model = Pose;
 
     const SAMPLE: usize = SAMPLE;
-    const SAMPLE_GATES: f64 = 4.0;
 
     fn len(&self) -> usize {
-        self.points.len()
+        <[_]>::len(self)
     }
 
     fn minimal(&self, sample: &[usize]) -> impl IntoIterator<Item = Pose> {
-        three_points(&ransac::chosen(self.points, sample), &ransac::chosen(self.seen, sample))
+        let sample: [Correspondence<_>; SAMPLE] = ransac::chosen(self, sample);
+        three_points(&sample.map(|seen| seen.point), &sample.map(|seen| seen.xy))
     }
 
     /// Infinite behind the camera.
     fn squared_residual(&self, pose: &Pose, datum: usize) -> f64 {
-        let placed = pose.apply(&self.points[datum]);
-        let squared = (placed.xy() / placed.z - self.seen[datum]).norm_squared();
-        if placed.z > 0.0 { self.weights[datum] * squared } else { f64::INFINITY }
+        let Correspondence { point, xy, weight } = &self[datum];
+        let placed = pose.apply(point);
+        let squared = (placed.xy() / placed.z - xy).norm_squared();
+        if placed.z > 0.0 { weight * squared } else { f64::INFINITY }
     }
 
-    fn refined(&self, pose: &Pose, gate: f64) -> Option<Pose> {
-        Some(ransac::refined(self, pose, gate))
-    }
-}
-
-impl Refinable<6> for Correspondences<'_> {
     fn residual(&self, pose: &Pose, datum: usize) -> Option<(Vector2<f64>, [SVector<f64, 6>; 2], f64)> {
+        let Correspondence { point, xy, weight } = &self[datum];
         let intrinsics = Intrinsics::from_focal(1.0);
-        let projection = Projection::new(&intrinsics, pose, &self.points[datum]);
+        let projection = Projection::new(&intrinsics, pose, point);
         let gradients = projection.gradients().by_pose.map(SVector::from);
-        (projection.at.z > 0.0).then(|| (projection.image - self.seen[datum], gradients, self.weights[datum]))
+        (projection.at.z > 0.0).then(|| (projection.image - xy, gradients, *weight))
     }
 
     fn moved(&self, pose: &Pose, step: &SVector<f64, 6>) -> Option<Pose> {
@@ -212,8 +184,9 @@ mod tests {
         (scene.points.clone(), seen.collect())
     }
 
-    fn of<'a>(points: &'a [Vector3<f64>], seen: &'a [Vector2<f64>], weights: &'a [f64]) -> Correspondences<'a> {
-        Correspondences { points, seen, weights }
+    fn of(points: &[Vector3<f64>], seen: &[Vector2<f64>], weights: &[f64]) -> Vec<Correspondence<Vector3<f64>>> {
+        let seen = points.iter().zip(seen).zip(weights);
+        seen.map(|((&point, &xy), &weight)| Correspondence { point, xy, weight }).collect()
     }
 
     fn distance(a: &Pose, b: &Pose) -> f64 {
@@ -253,7 +226,8 @@ mod tests {
                 .collect();
             seen[..36].rotate_left(7);
             let gate = CHI_SQUARE_OF_TWO * NOISE * NOISE;
-            let found = robust_rotation(&of(&directions, &seen, &[1.0; 60]), gate, 0, &mut rng, &StopToken::default());
+            let seen = of(&directions, &seen, &[1.0; 60]);
+            let found = robust(&seen, gate, true, 0, &mut rng, &StopToken::default());
             let RobustModel { model, inlier, .. } = found.expect("a rotation");
             let off = (model.rotation - turned).norm();
             println!("seed {seed}: off by {off:.1e}, {} inliers", inlier.iter().filter(|inlier| **inlier).count());
@@ -264,7 +238,7 @@ mod tests {
         }
         let (direction, image, mut rng) = ([Vector3::z()], [Vector2::zeros()], ChaCha8Rng::seed_from_u64(1));
         let one = of(&direction, &image, &[1.0]);
-        assert_eq!(robust_rotation(&one, 1e-4, 0, &mut rng, &StopToken::default()), None);
+        assert_eq!(robust(&one, 1e-4, true, 0, &mut rng, &StopToken::default()), None);
     }
 
     #[test]
@@ -275,9 +249,10 @@ mod tests {
         assert!(three_points(&[nan, same, same * 2.0], &[Vector2::zeros(); 3]).is_empty());
         let mut rng = ChaCha8Rng::seed_from_u64(1);
         let stop = StopToken::default();
-        assert_eq!(robust(&of(&[same; 2], &[Vector2::zeros(); 2], &[1.0; 2]), 1e-4, 0, &mut rng, &stop), None);
-        assert_eq!(robust(&of(&[same; 9], &[Vector2::zeros(); 9], &[1.0; 9]), 1e-4, 0, &mut rng, &stop), None);
-        assert_eq!(robust(&of(&[same; 9], &[Vector2::zeros(); 9], &[1.0; 9]), f64::NAN, 0, &mut rng, &stop), None);
+        let seen = of(&[same; 9], &[Vector2::zeros(); 9], &[1.0; 9]);
+        assert_eq!(robust(&seen[..2], 1e-4, false, 0, &mut rng, &stop), None);
+        assert_eq!(robust(&seen, 1e-4, false, 0, &mut rng, &stop), None);
+        assert_eq!(robust(&seen, f64::NAN, false, 0, &mut rng, &stop), None);
     }
 
     #[test]
@@ -294,8 +269,8 @@ mod tests {
                 }
             }
             let (gate, weights) = (CHI_SQUARE_OF_TWO * NOISE * NOISE, vec![1.0; seen.len()]);
-            let found =
-                robust(&of(&points, &seen, &weights), gate, 0, &mut rng, &StopToken::default()).expect("a pose");
+            let seen = of(&points, &seen, &weights);
+            let found = robust(&seen, gate, false, 0, &mut rng, &StopToken::default()).expect("a pose");
             let right = found.inlier.iter().enumerate().filter(|(k, inlier)| (k % 3 == 0) == **inlier).count();
             let away = distance(&found.model, &scene.poses[2]);
             println!("seed {seed}: {right} of 90 verdicts right, pose off by {away}");
@@ -319,8 +294,8 @@ mod tests {
             let weights: Vec<f64> = (0..seen.len()).map(|k| 1.0 / (factor(k) * factor(k))).collect();
             let mut away = |weights: &[f64]| {
                 let gate = CHI_SQUARE_OF_TWO * NOISE * NOISE;
-                let found =
-                    robust(&of(&points, &seen, weights), gate, 0, &mut rng, &StopToken::default()).expect("a pose");
+                let seen = of(&points, &seen, weights);
+                let found = robust(&seen, gate, false, 0, &mut rng, &StopToken::default()).expect("a pose");
                 (distance(&found.model, &scene.poses[2]), found.inlier_count())
             };
             let (by_weights, by_all) = (away(&weights), away(&vec![1.0; seen.len()]));
@@ -354,8 +329,8 @@ mod tests {
                     *image = placed.xy() / placed.z + 3.0 * NOISE * Vector2::new(angle.cos(), angle.sin());
                 }
             }
-            let found = robust(&of(&points, &seen, &vec![1.0; seen.len()]), gate, 0, &mut rng, &StopToken::default())
-                .expect("a pose");
+            let seen = of(&points, &seen, &[1.0; 100]);
+            let found = robust(&seen, gate, false, 0, &mut rng, &StopToken::default()).expect("a pose");
             let kept = found.inlier[..40].iter().filter(|&&inlier| inlier).count();
             right += usize::from(kept == 40);
         }
@@ -369,10 +344,10 @@ mod tests {
         let scene = testing::scene(1, 4, 100, 0.0);
         let (points, mut seen) = correspondences(&scene, 2);
         seen[50..].reverse();
+        let seen = of(&points, &seen, &[1.0; 100]);
         let drawn_for = |inliers_to_beat: usize| {
             let mut rng = ChaCha8Rng::seed_from_u64(1);
-            let all = [1.0; 100];
-            let found = robust(&of(&points, &seen, &all), 1e-8, inliers_to_beat, &mut rng, &StopToken::default());
+            let found = robust(&seen, 1e-8, false, inliers_to_beat, &mut rng, &StopToken::default());
             (found.map_or(0, |found| found.inlier_count()), rng.get_word_pos())
         };
         let (inliers, of_all) = drawn_for(0);

@@ -13,15 +13,17 @@ const CONFIDENCE: f64 = 0.99;
 /// Samples between two looks at the stop token: some milliseconds.
 const STOP_EVERY: usize = 32;
 
-/// A kind of model, and the data it is sought in.
-pub(crate) trait Estimator {
+/// A kind of model, and the data it is sought in. A model is refined by the gradients of its residuals of two
+/// coordinates, by `N` unknowns, unless the estimator has a [`refined`](Self::refined) of its own: then `N` is 0, and
+/// [`residual`](Self::residual) and [`moved`](Self::moved) are left out.
+pub(crate) trait Estimator<const N: usize>: Sized {
     type Model: Clone;
 
     /// Data that determine a model, up to a few solutions.
     const SAMPLE: usize;
     /// Gates within which a datum agrees with the model of a sample: what few noisy data determine is noisier than what
     /// many do.
-    const SAMPLE_GATES: f64;
+    const SAMPLE_GATES: f64 = 4.0;
 
     /// Number of data.
     fn len(&self) -> usize;
@@ -38,23 +40,32 @@ pub(crate) trait Estimator {
     /// Squared residual of a datum; infinite or not a number where it has none.
     fn squared_residual(&self, model: &Self::Model, datum: usize) -> f64;
 
-    /// The model fitted to the data that are within about this squared residual of it; `None` where there are too few.
-    fn refined(&self, model: &Self::Model, gate: f64) -> Option<Self::Model>;
-}
-
-/// An estimator whose models are refined by the gradients of its residuals of two coordinates, by `N` unknowns.
-pub(crate) trait Refinable<const N: usize>: Estimator {
     /// Residual, in the units of a datum of weight 1, its gradients and the weight of its square; `None` where a datum
     /// has none.
-    fn residual(&self, model: &Self::Model, datum: usize) -> Option<(Vector2<f64>, [SVector<f64, N>; 2], f64)>;
+    fn residual(&self, _model: &Self::Model, _datum: usize) -> Option<(Vector2<f64>, [SVector<f64, N>; 2], f64)> {
+        None
+    }
 
     /// The model moved by a step; `None` where that is none.
-    fn moved(&self, model: &Self::Model, step: &SVector<f64, N>) -> Option<Self::Model>;
+    fn moved(&self, _model: &Self::Model, _step: &SVector<f64, N>) -> Option<Self::Model> {
+        None
+    }
 
     /// Direction in which a model moves without changing any residual, which a refinement pins; zero where there is
     /// none.
     fn gauge(&self, _model: &Self::Model) -> SVector<f64, N> {
         SVector::zeros()
+    }
+
+    /// The model fitted to the data that are within about this squared residual of it; `None` where there are too few.
+    ///
+    /// By Levenberg-Marquardt on the residuals, under a Geman-McClure loss of scale `sqrt(gate)`; never worse than the
+    /// start.
+    fn refined(&self, start: &Self::Model, gate: f64) -> Option<Self::Model> {
+        let mut model = start.clone();
+        let mut refinement = Refinement { estimator: self, gate, normal: Normal::<N>::zeros() };
+        levenberg_marquardt::minimise(&mut refinement, &mut model, &REFINEMENT, &StopToken::default());
+        Some(model)
     }
 }
 
@@ -63,21 +74,13 @@ const REFINEMENT: Options = Options { max_iterations: 10, relative_tolerance: 1e
 /// Gates beyond which a datum weighs nothing in a refinement: a hundredth of its weight is left there.
 const WEIGHED_GATES: f64 = 9.0;
 
-/// Levenberg-Marquardt on the residuals under a Geman-McClure loss of scale `sqrt(gate)`; never worse than the start.
-pub(crate) fn refined<const N: usize, E: Refinable<N>>(estimator: &E, start: &E::Model, gate: f64) -> E::Model {
-    let mut model = start.clone();
-    let mut refinement = Refinement { estimator, gate, normal: Normal::<N>::zeros() };
-    levenberg_marquardt::minimise(&mut refinement, &mut model, &REFINEMENT, &StopToken::default());
-    model
-}
-
 struct Refinement<'a, const N: usize, E> {
     estimator: &'a E,
     gate: f64,
     normal: Normal<N>,
 }
 
-impl<const N: usize, E: Refinable<N>> levenberg_marquardt::LeastSquares for Refinement<'_, N, E> {
+impl<const N: usize, E: Estimator<N>> levenberg_marquardt::LeastSquares for Refinement<'_, N, E> {
     type State = E::Model;
 
     fn cost(&self, model: &E::Model) -> f64 {
@@ -140,7 +143,7 @@ impl<M> RobustModel<M> {
 /// within one. Once `stop` fires, the best so far.
 ///
 /// Returns `None` for too few data, no usable gate, or when no sample gives a model.
-pub(crate) fn estimate<E: Estimator>(
+pub(crate) fn estimate<const N: usize, E: Estimator<N>>(
     estimator: &E,
     gate: f64,
     start: Option<E::Model>,
@@ -168,7 +171,7 @@ pub(crate) fn estimate<E: Estimator>(
     Some(RobustModel { model, inlier, cost: cost / estimator.len() as f64 })
 }
 
-struct Search<'a, E: Estimator> {
+struct Search<'a, const N: usize, E: Estimator<N>> {
     estimator: &'a E,
     gate: f64,
     best: Option<(E::Model, f64)>,
@@ -178,7 +181,7 @@ struct Search<'a, E: Estimator> {
     wanted: usize,
 }
 
-impl<E: Estimator> Search<'_, E> {
+impl<const N: usize, E: Estimator<N>> Search<'_, N, E> {
     /// Takes a sample's model where it is better than those before, and optimises it.
     fn offer(&mut self, model: E::Model) {
         let wide = E::SAMPLE_GATES * self.gate;

@@ -4,7 +4,8 @@ use nalgebra::{Matrix4, SMatrix, SVector, Vector2};
 use rand_chacha::ChaCha8Rng;
 
 use super::null_vector::{projection_equations, smallest_eigenvector};
-use super::ransac::{self, Estimator, Refinable};
+use super::observation::Correspondence;
+use super::ransac::{self, Estimator};
 use super::triangulation::f64xn::{F64xN, Symmetric};
 use super::triangulation::reprojection;
 use super::{Camera, Point};
@@ -17,18 +18,18 @@ const MOST_SAMPLES: usize = 20_000;
 
 /// The camera of least algebraic error (Hartley & Zisserman, section 7.1), unit Frobenius norm.
 ///
-/// * `points`: homogeneous, at least [`LEAST_POINTS`], not all on a plane or a twisted cubic with the camera
+/// * `seen`: at least [`LEAST_POINTS`], not all on a plane or a twisted cubic with the camera
 ///
 /// Returns `None` for too few points or when nothing finite comes of them.
-fn linear(points: &[Point], images: &[Vector2<f64>]) -> Option<Camera> {
-    if points.len() < LEAST_POINTS || points.len() != images.len() {
+fn linear(seen: &[Correspondence<Point>]) -> Option<Camera> {
+    if seen.len() < LEAST_POINTS {
         return None;
     }
     let mut normal = SMatrix::<f64, 12, 12>::zeros();
-    for (point, image) in points.iter().zip(images) {
+    for Correspondence { point, xy, .. } in seen {
         // Unit homogeneous vectors: no point weighs more for its scale.
         let unit = point.try_normalize(f64::MIN_POSITIVE)?;
-        for equation in projection_equations::<4, 12>(&unit, image) {
+        for equation in projection_equations::<4, 12>(&unit, xy) {
             normal += equation * equation.transpose();
         }
     }
@@ -59,66 +60,52 @@ fn six_points(points: &[Point; LEAST_POINTS], images: &[Vector2<f64>; LEAST_POIN
 
 /// The camera that most images agree with, refined on those that do.
 ///
-/// * `weights`: of the squared residuals, see [`Observation::weight`](super::observation::Observation::weight)
 /// * `gate`: squared residual below which an image of weight 1 agrees, in squared units of the images
 ///
 /// Reliable down to three right images in ten; once `stop` fires, the best so far. Returns the camera and which images
 /// agree; `None` when fewer than `least` do.
 pub fn robust(
-    points: &[Point],
-    images: &[Vector2<f64>],
-    weights: &[f64],
+    seen: &[Correspondence<Point>],
     gate: f64,
     least: usize,
     rng: &mut ChaCha8Rng,
     stop: &StopToken,
 ) -> Option<(Camera, Vec<bool>)> {
-    if points.len() != images.len() || points.len() != weights.len() {
-        return None;
-    }
-    let resection = Resection { points: points.iter().map(|point| point.normalize()).collect(), images, weights };
+    let unit = seen.iter().map(|seen| Correspondence { point: seen.point.normalize(), ..*seen });
+    let unit = UnitPoints(unit.collect());
     // Most images are right as a rule: all together first.
-    let all = linear(points, images);
-    let found = ransac::estimate(&resection, gate, all, 0, MOST_SAMPLES, rng, stop)?;
+    let found = ransac::estimate(&unit, gate, linear(seen), 0, MOST_SAMPLES, rng, stop)?;
     (found.inlier_count() >= least.max(LEAST_POINTS)).then_some((found.model, found.inlier))
 }
 
-struct Resection<'a> {
-    /// Unit norm.
-    points: Vec<Point>,
-    images: &'a [Vector2<f64>],
-    weights: &'a [f64],
-}
+/// Images of points of unit norm.
+struct UnitPoints(Vec<Correspondence<Point>>);
 
-impl Estimator for Resection<'_> {
+impl Estimator<12> for UnitPoints {
     type Model = Camera;
 
     const SAMPLE: usize = LEAST_POINTS;
     const SAMPLE_GATES: f64 = 25.0;
 
     fn len(&self) -> usize {
-        self.points.len()
+        self.0.len()
     }
 
     fn minimal(&self, sample: &[usize]) -> impl IntoIterator<Item = Camera> {
-        six_points(&ransac::chosen(&self.points, sample), &ransac::chosen(self.images, sample))
+        let sample: [Correspondence<Point>; LEAST_POINTS] = ransac::chosen(&self.0, sample);
+        six_points(&sample.map(|seen| seen.point), &sample.map(|seen| seen.xy))
     }
 
     fn squared_residual(&self, camera: &Camera, datum: usize) -> f64 {
-        self.weights[datum] * reprojection(camera, &self.points[datum], &self.images[datum]).norm_squared()
+        let Correspondence { point, xy, weight } = &self.0[datum];
+        weight * reprojection(camera, point, xy).norm_squared()
     }
 
-    fn refined(&self, camera: &Camera, gate: f64) -> Option<Camera> {
-        Some(ransac::refined(self, camera, gate))
-    }
-}
-
-impl Refinable<12> for Resection<'_> {
     fn residual(&self, camera: &Camera, datum: usize) -> Option<(Vector2<f64>, [SVector<f64, 12>; 2], f64)> {
-        let (point, image) = (&self.points[datum], &self.images[datum]);
-        let residual = reprojection(camera, point, image);
+        let Correspondence { point, xy, weight } = &self.0[datum];
+        let residual = reprojection(camera, point, xy);
         let nearer = point / (camera.row(2) * point).x;
-        Some((residual, projection_equations(&nearer, &(residual + image)), self.weights[datum]))
+        Some((residual, projection_equations(&nearer, &(residual + xy)), *weight))
     }
 
     fn moved(&self, camera: &Camera, step: &SVector<f64, 12>) -> Option<Camera> {
@@ -141,9 +128,14 @@ mod tests {
 
     const NOISE: f64 = 0.001;
 
+    fn of(points: &[Point], images: &[Vector2<f64>], weights: &[f64]) -> Vec<Correspondence<Point>> {
+        let seen = points.iter().zip(images).zip(weights);
+        seen.map(|((&point, &xy), &weight)| Correspondence { point, xy, weight }).collect()
+    }
+
     fn found(points: &[Point], images: &[Vector2<f64>], weights: &[f64], least: usize) -> Option<(Camera, Vec<bool>)> {
-        let mut rng = ChaCha8Rng::seed_from_u64(1);
-        robust(points, images, weights, CHI_SQUARE_OF_TWO * NOISE * NOISE, least, &mut rng, &StopToken::default())
+        let (seen, mut rng) = (of(points, images, weights), ChaCha8Rng::seed_from_u64(1));
+        robust(&seen, CHI_SQUARE_OF_TWO * NOISE * NOISE, least, &mut rng, &StopToken::default())
     }
 
     /// Distance between the images of a point in two cameras.
@@ -266,8 +258,8 @@ mod tests {
         let scattered: Vec<Vector2<f64>> =
             (0..40).map(|k| Vector2::new((k as f64 * 1.7).sin(), (k as f64 * 2.9).cos())).collect();
         assert!(found(&points, &scattered, &[1.0; 40], 10).is_none());
-        assert!(linear(&points[..5], &images[..5]).is_none());
-        assert!(linear(&[Point::zeros(); 8], &images[..8]).is_none());
+        assert!(linear(&of(&points[..5], &images, &[1.0; 5])).is_none());
+        assert!(linear(&of(&[Point::zeros(); 8], &images, &[1.0; 8])).is_none());
         let nan = vec![Point::from_element(f64::NAN); 8];
         assert!(found(&nan, &images[..8], &[1.0; 8], 6).is_none());
     }

@@ -14,7 +14,7 @@ use rand_chacha::ChaCha8Rng;
 use super::bundle::metric::{Intrinsics, Pose, Projection};
 use super::levenberg_marquardt::Normal;
 use super::pose;
-use super::ransac::{self, Estimator, Refinable, RobustModel};
+use super::ransac::{self, Estimator, RobustModel};
 use crate::domain::StopToken;
 
 /// Samples at most. Where half of the observations are right, one sample in sixteen is, and seventy suffice; where a
@@ -142,11 +142,10 @@ impl<'a> CrossObservations<'a> {
     }
 }
 
-impl Estimator for CrossObservations<'_> {
+impl Estimator<UNKNOWNS> for CrossObservations<'_> {
     type Model = Similarity;
 
     const SAMPLE: usize = OF_CAMERA + 1;
-    const SAMPLE_GATES: f64 = pose::Correspondences::SAMPLE_GATES;
 
     fn len(&self) -> usize {
         self.observations.len()
@@ -175,12 +174,6 @@ impl Estimator for CrossObservations<'_> {
         if placed.z > 0.0 { seen.weight * squared } else { f64::INFINITY }
     }
 
-    fn refined(&self, similarity: &Similarity, gate: f64) -> Option<Similarity> {
-        Some(ransac::refined(self, similarity, gate))
-    }
-}
-
-impl Refinable<UNKNOWNS> for CrossObservations<'_> {
     fn residual(
         &self,
         similarity: &Similarity,

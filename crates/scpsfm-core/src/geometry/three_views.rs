@@ -7,13 +7,6 @@ use super::null_vector::{projection_equations, smallest_eigenvector};
 use super::observation::Observation;
 use super::{Camera, triangulation};
 
-/// Fundamental matrices of the pairs of three views.
-pub struct FundamentalMatrices<'a> {
-    pub first_to_second: &'a Fundamental,
-    pub first_to_third: &'a Fundamental,
-    pub second_to_third: &'a Fundamental,
-}
-
 /// Cameras whose pairs have these fundamental matrices, up to a projective transform. Where the matrices contradict
 /// each other, the third camera is that of least algebraic error.
 ///
@@ -21,6 +14,7 @@ pub struct FundamentalMatrices<'a> {
 /// skew-symmetric where `F` is the matrix from the view of the camera `Q` (result 9.12), and it images the points that
 /// all three views see, which the first two determine.
 ///
+/// * `[first_to_second, first_to_third, second_to_third]`: of the pairs of views
 /// * `common`: image points of tracks that all three views see
 ///
 /// Returns `None` where the equations hold what is no finite number.
@@ -28,10 +22,13 @@ pub struct FundamentalMatrices<'a> {
 /// # Pitfall
 /// Where the three centres are on a line, the matrices leave four unknowns of the third camera open, and a common point
 /// determines one of them: with fewer than four of these the camera is one of many.
-pub fn cameras(matrices: &FundamentalMatrices, common: &[[Vector2<f64>; 3]]) -> Option<[Camera; 3]> {
-    let [first, second] = matrices.first_to_second.cameras();
+pub fn cameras(
+    [first_to_second, first_to_third, second_to_third]: [&Fundamental; 3],
+    common: &[[Vector2<f64>; 3]],
+) -> Option<[Camera; 3]> {
+    let [first, second] = first_to_second.cameras();
     let mut normal = SMatrix::<f64, 12, 12>::zeros();
-    for (fundamental, camera) in [(matrices.first_to_third, &first), (matrices.second_to_third, &second)] {
+    for (fundamental, camera) in [(first_to_third, &first), (second_to_third, &second)] {
         let from = fundamental.matrix() * camera;
         for i in 0..4 {
             for j in i..4 {
@@ -84,9 +81,7 @@ mod tests {
                 fundamental::robust(&matches, 1e-5, &mut rng, &StopToken::default()).expect("enough matches").model
             };
             let matrices = [matrix(0, 1, 2), matrix(0, 2, 1), matrix(1, 2, 0)];
-            let [first_to_second, first_to_third, second_to_third] = &matrices;
-            let matrices = FundamentalMatrices { first_to_second, first_to_third, second_to_third };
-            let found = cameras(&matrices, &[[0, 1, 2].map(|view| of(view, 59))]).expect("cameras");
+            let found = cameras(matrices.each_ref(), &[[0, 1, 2].map(|view| of(view, 59))]).expect("cameras");
             let truth = scene.cameras();
             for (from, to) in [(0, 1), (0, 2), (1, 2)] {
                 let [found, truth] =

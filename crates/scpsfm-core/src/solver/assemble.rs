@@ -6,7 +6,7 @@ use nalgebra::{Matrix3, Matrix4};
 use super::attempt::Attempt;
 use super::baselines::Decided;
 use super::calibration::Outcome;
-use super::classification::{self, Judged};
+use super::classification::{Judged, TrackPoint};
 use super::consensus::{LEAST_INLIERS, LEAST_SUPPORT, LEAST_VIEWS};
 use super::error::Error;
 use super::noise_model;
@@ -36,7 +36,7 @@ pub fn solution(ended: Ended, problem: &Problem, mut recorder: Recorder) -> Resu
     let mut warnings = problem.warnings.clone();
     let mut first = match Assembled::of(ended, problem, &mut recorder) {
         Ok(first) => first,
-        Err(Unsolved { seed }) => {
+        Err(seed) => {
             warnings.push(why_unsolved(problem, seed.as_deref()));
             return Ok(unsolved(problem, seed.as_deref(), warnings, recorder));
         }
@@ -62,15 +62,10 @@ struct Assembled {
     evidence: f64,
 }
 
-/// Nothing stands.
-struct Unsolved {
-    /// What came nearest to it.
-    seed: Option<Box<Attempt>>,
-}
-
 impl Assembled {
-    /// Assembles what was found, and judges every track by it where that was not done already.
-    fn of(ended: Ended, problem: &Problem, recorder: &mut Recorder) -> Result<Self, Unsolved> {
+    /// Assembles what was found, and judges every track by it where that was not done already. Where nothing stands:
+    /// what came nearest to it.
+    fn of(ended: Ended, problem: &Problem, recorder: &mut Recorder) -> Result<Self, Option<Box<Attempt>>> {
         let evidence = ended.evidence(problem);
         let (reconstruction, seed) = match ended {
             Ended::Extended(extended) => (Some(extended.reconstruction(problem)), Some(Box::new(extended.seed))),
@@ -79,7 +74,7 @@ impl Assembled {
         };
         let (mut reconstruction, mut seed) = match (reconstruction, seed) {
             (Some(reconstruction), Some(seed)) => (reconstruction, seed),
-            (_, seed) => return Err(Unsolved { seed }),
+            (_, seed) => return Err(seed),
         };
         recorder.enter(Stage::Classify);
         let mut judged = seed.judged.take().unwrap_or_else(|| reconstruction.judged(problem, &seed, recorder));
@@ -178,22 +173,21 @@ impl Reconstruction {
             .enumerate()
             .map(|(track, point)| place(point.as_ref()?, track, &judged.retained[track]))
             .collect();
-        let split = |split: &classification::SplitPoint| TrackSplit {
+        let split = |split: &TrackPoint| TrackSplit {
             track: split.track as u32,
             number: split.number,
             weight: split.weight as f32,
             point: place(&split.point, split.track, &split.retained),
         };
         let splits = judged.splits.iter().map(split).collect();
-        let two_view_track = |found: &classification::TwoViewPoint| TwoViewTrack {
+        let two_view_track = |found: &TrackPoint| TwoViewTrack {
             track: found.track as u32,
             weight: found.weight as f32,
             part: self.geometry.component_of_track[found.track],
             point: place(&found.point, found.track, &found.retained),
         };
         // What depths or a method of its own make an inlier needs no other verdict.
-        let is_told =
-            |found: &&classification::TwoViewPoint| !judged.tracks.inlier[found.track] && self.holds(&found.retained);
+        let is_told = |found: &&TrackPoint| !judged.tracks.inlier[found.track] && self.holds(&found.retained);
         let two_view_tracks = judged.two_view_points.iter().filter(is_told).map(two_view_track).collect();
         if self.geometry.component_of_view.iter().any(|&component| component > 0) {
             let of_point = |(point, component): (&Option<_>, &u32)| point.map_or(0, |_: [f64; 3]| *component);
@@ -346,7 +340,7 @@ fn unsolved(problem: &Problem, attempt: Option<&Attempt>, warnings: Vec<Warning>
 /// A solution that says how the solve went, and nothing else. The last progress tells what [`Recorder::found`] was told
 /// last: the caller says before what the solution holds.
 fn nothing(problem: &Problem, attempt: Option<&Attempt>, warnings: Vec<Warning>, recorder: Recorder) -> Solution {
-    let (seconds, iterations) = (recorder.seconds(), recorder.iteration());
+    let (seconds, iterations) = (recorder.seconds(), recorder.progress.iteration);
     let (stages, history) = recorder.finish();
     Solution {
         status: Status::NoReconstruction,

@@ -6,7 +6,7 @@ use std::collections::BTreeSet;
 use nalgebra::Vector2;
 
 use super::block::{self, Block};
-use super::calibration::CalibrationOptions;
+use super::calibration::{CalibrationOptions, Uncalibrated};
 use super::consensus::{LEAST_INLIERS, LEAST_VIEWS, NoiseOptions};
 use super::error::Error;
 use super::known_focal::{KnownFocal, known_focal};
@@ -18,6 +18,7 @@ use crate::geometry::bundle::metric::Intrinsics;
 use crate::geometry::measurement::Normalization;
 use crate::geometry::observation::Observation;
 use crate::geometry::statistics::median;
+use crate::geometry::{Camera, Point};
 use crate::parallel::Threads;
 
 /// Share of its observations that a complete track must retain: of 100 permuted tracks in ten views about one holds
@@ -231,6 +232,36 @@ impl<'a> Problem<'a> {
         cameras.dedup();
         let place = |view: &usize| cameras.partition_point(|camera| *camera < self.camera_of[*view]);
         (views.iter().map(place).collect(), cameras)
+    }
+
+    /// What there is to calibrate of some views.
+    ///
+    /// * `reconstruction`: their cameras and points
+    /// * `noise`, `group_of`, `focal_priors`, `heartbeat`: as of [`Uncalibrated`]
+    pub fn uncalibrated<'b>(
+        &'b self,
+        reconstruction: (&'b [Camera], &'b [Point]),
+        observations: &'b [Observation],
+        noise: f64,
+        group_of: &'b [usize],
+        focal_priors: &'b [Option<FocalPrior>],
+        heartbeat: &'b dyn Fn(),
+    ) -> Uncalibrated<'b> {
+        let (cameras, points) = reconstruction;
+        Uncalibrated {
+            cameras,
+            points,
+            observations,
+            noise,
+            outlier_density: self.outlier_density,
+            group_of,
+            focal_priors,
+            focal_per_view: self.has_own_focals(),
+            scale_px: self.scale_px,
+            options: &self.calibration_options,
+            stop: self.stop,
+            heartbeat,
+        }
     }
 
     /// Squared residual, normalised units, within which an observation agrees with its point at this noise, of whose

@@ -36,41 +36,23 @@ const HEARTBEAT_PERIOD: Duration = Duration::from_millis(100);
 /// Verdicts that a track gets at most.
 const JUDGED_TIMES: usize = 2;
 
-/// State of the best hypothesis, as progress reports it.
-#[derive(Debug, Clone, Copy, Default)]
-pub struct HypothesisState {
-    pub iteration: u32,
-    pub losses: Option<Losses>,
-    pub head: Option<HeadProgress>,
-    pub inliers: u32,
-    pub focal_px: Option<f64>,
-    pub best_cost: Option<f64>,
-}
-
 /// Wraps the caller's observer for one solve.
 pub struct Recorder<'a> {
     observer: &'a mut dyn Observer,
     started: Instant,
-    stage: Stage,
     stage_started: Instant,
     stages: Vec<StageTime>,
-    fraction: f64,
-    /// The block that is solved, counted from 0, and how many may be: each has an equal share of the whole.
-    block: usize,
-    blocks: usize,
     /// Share of the whole that the blocks have: all, or what an extension leaves them.
     share_of_blocks: f64,
     extending: bool,
     /// State before the block of a further component, while that is solved.
-    before_component: Option<HypothesisState>,
-    /// Network iterations of the blocks before.
-    earlier_iterations: u32,
+    before_component: Option<Progress>,
     history: Vec<Progress>,
     /// Every so many records go into the history; doubled whenever it is full.
     stride: usize,
     records: usize,
-    pub hypothesis: HypothesisState,
-    reconstruction: ReconstructionProgress,
+    /// What is reported next; the seconds are added then.
+    pub progress: Progress,
     last_report: Instant,
 }
 
@@ -82,44 +64,38 @@ impl<'a> Recorder<'a> {
         Self {
             observer,
             started: now,
-            stage: Stage::Prepare,
             stage_started: now,
             stages: Vec::new(),
-            fraction: 0.0,
-            block: 0,
-            blocks: 1,
             share_of_blocks: 1.0,
             extending: false,
             before_component: None,
-            earlier_iterations: 0,
             history: Vec::new(),
             stride: 1,
             records: 0,
-            hypothesis: HypothesisState::default(),
-            reconstruction: ReconstructionProgress { views: views as u32, ..ReconstructionProgress::default() },
+            progress: Progress {
+                reconstruction: ReconstructionProgress { views: views as u32, ..ReconstructionProgress::default() },
+                ..Progress::default()
+            },
             last_report: now,
         }
     }
 
     /// Begins another block, `block` of at most `blocks`, counted from 0.
     pub fn begin_block(&mut self, block: usize, blocks: usize) {
-        let views = self.reconstruction.views;
-        self.reconstruction = ReconstructionProgress {
+        self.progress.reconstruction = ReconstructionProgress {
             block: block as u32 + 1,
             blocks: blocks.max(1) as u32,
-            views,
+            views: self.progress.reconstruction.views,
             ..ReconstructionProgress::default()
         };
-        self.block = block;
         self.extending = false;
-        self.blocks = blocks.max(1);
         self.begin_again();
     }
 
     /// Begins the search of a block anew: its course so far counts as work.
     pub fn begin_again(&mut self) {
-        self.earlier_iterations += self.hypothesis.iteration;
-        self.hypothesis = HypothesisState::default();
+        self.progress =
+            Progress { losses: None, head: None, inliers: 0, focal_px: None, best_cost: None, ..self.progress };
     }
 
     /// Says beforehand that the best block will be extended.
@@ -134,30 +110,30 @@ impl<'a> Recorder<'a> {
 
     /// Begins the block of a further component: its course counts as work, and moves the share done no further.
     pub fn begin_component(&mut self, component: u32) {
-        self.reconstruction.part = component;
-        self.earlier_iterations += self.hypothesis.iteration;
-        self.before_component = Some(std::mem::take(&mut self.hypothesis));
+        self.progress.reconstruction.part = component;
+        self.before_component = Some(self.progress);
+        self.begin_again();
     }
 
     /// Ends it: what stands is again what stood before.
     pub fn end_component(&mut self) {
-        self.earlier_iterations += self.hypothesis.iteration;
         if let Some(before) = self.before_component.take() {
-            self.hypothesis = HypothesisState { iteration: 0, ..before };
+            let Progress { stage, iteration, .. } = self.progress;
+            self.progress = Progress { stage, iteration, ..before };
         }
         self.enter(Stage::Extend);
     }
 
     /// All components there are to be are built.
     pub fn end_components(&mut self) {
-        self.reconstruction.part = 0;
+        self.progress.reconstruction.part = 0;
     }
 
     /// An iteration of the network is done; told with the next [`Self::report`].
     pub fn optimised(&mut self, head: HeadProgress, losses: Losses) {
-        self.hypothesis.iteration += 1;
-        self.hypothesis.losses = Some(losses);
-        self.hypothesis.head = Some(head);
+        self.progress.iteration += 1;
+        self.progress.losses = Some(losses);
+        self.progress.head = Some(head);
     }
 
     /// Records what stands now instead of what the search found: after every step that changes it, and before
@@ -166,22 +142,22 @@ impl<'a> Recorder<'a> {
     /// * `inliers`: tracks
     /// * `focal_px`: of the first camera that has one; `None` where the focal length is not determined
     pub fn found(&mut self, inliers: usize, focal_px: Option<f64>) {
-        self.hypothesis.inliers = inliers as u32;
-        self.hypothesis.focal_px = focal_px;
+        self.progress.inliers = inliers as u32;
+        self.progress.focal_px = focal_px;
     }
 
     /// So many views have a camera. What a block of a further component has counts once it is among the others.
     pub fn registered(&mut self, views: usize) {
         if self.before_component.is_none() {
-            self.reconstruction.registered_views = views as u32;
+            self.progress.reconstruction.registered_views = views as u32;
         }
     }
 
     /// Enters a stage, ending the one before.
     pub fn enter(&mut self, stage: Stage) {
         self.close_stage();
-        self.reconstruction.step = None;
-        self.stage = stage;
+        self.progress.reconstruction.step = None;
+        self.progress.stage = stage;
         self.observer.stage(stage);
         self.report(0.0);
     }
@@ -189,9 +165,7 @@ impl<'a> Recorder<'a> {
     /// Reports the current state to the observer; `within` is the share of the stage that is done.
     pub fn report(&mut self, within: f64) {
         self.advance(within);
-        let progress = self.progress();
-        self.observer.progress(&progress);
-        self.last_report = Instant::now();
+        let progress = self.report_progress();
         self.keep(progress);
     }
 
@@ -204,7 +178,7 @@ impl<'a> Recorder<'a> {
 
     /// The same, reported with the next [`Self::report`].
     pub fn begin_step(&mut self, task: Task, step: usize, steps: usize) {
-        self.reconstruction.step = Some(Step { task, step: step as u32, steps: steps as u32 });
+        self.progress.reconstruction.step = Some(Step { task, step: step as u32, steps: steps as u32 });
     }
 
     /// Tells how many verdicts there are; `tracks`: how many are judged.
@@ -218,54 +192,42 @@ impl<'a> Recorder<'a> {
     /// When that is depends on the machine, so that none of it goes into the history: one input has one answer.
     pub fn heartbeat(&mut self) {
         if self.last_report.elapsed() >= HEARTBEAT_PERIOD {
-            let progress = self.progress();
-            self.observer.progress(&progress);
-            self.last_report = Instant::now();
+            self.report_progress();
         }
+    }
+
+    /// Reports the current state to the observer, and returns what was reported.
+    fn report_progress(&mut self) -> Progress {
+        let progress = Progress { elapsed_seconds: self.seconds(), ..self.progress };
+        self.observer.progress(&progress);
+        self.last_report = Instant::now();
+        progress
     }
 
     fn advance(&mut self, within: f64) {
-        self.fraction = self.fraction.max(self.fraction_done(within.clamp(0.0, 1.0)));
-    }
-
-    fn progress(&self) -> Progress {
-        Progress {
-            stage: self.stage,
-            fraction: self.fraction,
-            iteration: self.iteration(),
-            losses: self.hypothesis.losses,
-            head: self.hypothesis.head,
-            inliers: self.hypothesis.inliers,
-            focal_px: self.hypothesis.focal_px,
-            best_cost: self.hypothesis.best_cost,
-            elapsed_seconds: self.seconds(),
-            reconstruction: self.reconstruction,
-        }
+        self.progress.fraction = self.progress.fraction.max(self.fraction_done(within.clamp(0.0, 1.0)));
     }
 
     fn fraction_done(&self, within: f64) -> f64 {
         if self.before_component.is_some() {
-            return self.fraction;
+            return self.progress.fraction;
         }
         let at = if self.extending { fraction_of_extension_at } else { fraction_at };
-        let begin = at(self.stage);
+        let begin = at(self.progress.stage);
         let end = Stage::ALL.into_iter().map(at).find(|&at| at > begin).unwrap_or(1.0);
         let done = begin + (end - begin) * within;
         if self.extending {
             self.share_of_blocks + (1.0 - self.share_of_blocks) * done
         } else {
-            self.share_of_blocks * (self.block as f64 + done) / self.blocks as f64
+            // Each block has an equal share. Before the first, both numbers are 0.
+            let ReconstructionProgress { block, blocks, .. } = self.progress.reconstruction;
+            self.share_of_blocks * (f64::from(block.max(1) - 1) + done) / f64::from(blocks.max(1))
         }
     }
 
     /// Hands interim weights on.
     pub fn weights(&mut self, weights: &[f32]) {
-        self.observer.weights(self.iteration(), weights);
-    }
-
-    /// Network iterations so far, over all blocks.
-    pub fn iteration(&self) -> u32 {
-        self.earlier_iterations + self.hypothesis.iteration
+        self.observer.weights(self.progress.iteration, weights);
     }
 
     /// Seconds since the solve began.
@@ -275,8 +237,8 @@ impl<'a> Recorder<'a> {
 
     /// Ends the last stage and gives back times and curves.
     pub fn finish(mut self) -> (Vec<StageTime>, Vec<Progress>) {
-        self.fraction = 1.0;
-        self.reconstruction.step = None;
+        self.progress.fraction = 1.0;
+        self.progress.reconstruction.step = None;
         self.report(1.0);
         self.close_stage();
         (self.stages, self.history)
@@ -286,9 +248,10 @@ impl<'a> Recorder<'a> {
     fn close_stage(&mut self) {
         let seconds = self.stage_started.elapsed().as_secs_f64();
         self.stage_started = Instant::now();
-        match self.stages.iter_mut().find(|entry| entry.stage == self.stage) {
+        let stage = self.progress.stage;
+        match self.stages.iter_mut().find(|entry| entry.stage == stage) {
             Some(entry) => entry.seconds += seconds,
-            None => self.stages.push(StageTime { stage: self.stage, seconds }),
+            None => self.stages.push(StageTime { stage, seconds }),
         }
     }
 
@@ -325,7 +288,7 @@ mod tests {
     fn what_is_found_last_is_told_last() {
         let mut silent = crate::domain::Silent;
         let mut recorder = Recorder::new(&mut silent, 10);
-        (recorder.hypothesis.inliers, recorder.hypothesis.focal_px) = (20, Some(700.0));
+        (recorder.progress.inliers, recorder.progress.focal_px) = (20, Some(700.0));
         recorder.enter(Stage::Calibrate);
         recorder.found(180, Some(812.5));
         let told = |history: &[Progress]| history.last().map(|record| (record.inliers, record.focal_px));

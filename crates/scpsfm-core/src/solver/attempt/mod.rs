@@ -289,7 +289,7 @@ pub fn calibrate(problem: &Problem, attempt: &mut Attempt, recorder: &mut Record
         }
     });
     if let Some(intrinsics) = attempt.calibration.as_ref().and_then(Outcome::intrinsics) {
-        recorder.hypothesis.focal_px = Some(intrinsics.focal * problem.scale_px);
+        recorder.progress.focal_px = Some(intrinsics.focal * problem.scale_px);
     }
     recorder.registered(projective.views.len());
     recorder.report(1.0);
@@ -337,8 +337,8 @@ fn search(
         return Ok(verified_by_depths(problem, attempt, consensus));
     }
     let (mut refined, ln_false_alarms) = grow::refine(complete, &consensus, spread::spread(complete), problem.stop);
-    recorder.hypothesis.inliers = refined.inlier_count() as u32;
-    recorder.hypothesis.best_cost = Some(refined.score);
+    recorder.progress.inliers = refined.inlier_count() as u32;
+    recorder.progress.best_cost = Some(refined.score);
     recorder.report(1.0);
     let counted = match &attempt.found.track_scores {
         Some(track_scores) => track_scores.counted(&refined.inliers()),
@@ -359,7 +359,7 @@ fn search(
     }
     if let Some((block, consensus)) = all_tracks::extend(problem, &attempt.block, &refined) {
         attempt.found.network_weights = carry_over(&attempt.found.network_weights, &attempt.block, &block);
-        recorder.hypothesis.inliers = consensus.inlier_count() as u32;
+        recorder.progress.inliers = consensus.inlier_count() as u32;
         // What the network says of a sample, it does not say of all.
         attempt.found.track_scores = None;
         (attempt.block, refined) = (block, consensus);
@@ -435,20 +435,9 @@ fn calibrate_projective(
     let some = projective.most_observed(most);
     let (group_of, cameras) = problem.cameras_of(&projective.views);
     let focal_priors: Vec<Option<FocalPrior>> = cameras.iter().map(|&camera| known[camera]).collect();
-    let to_calibrate = calibration::Uncalibrated {
-        cameras: &some.cameras,
-        points: &some.points,
-        observations: &some.observations,
-        noise: some.noise,
-        outlier_density: problem.outlier_density,
-        focal_per_view: problem.has_own_focals(),
-        group_of: &group_of,
-        focal_priors: &focal_priors,
-        scale_px: problem.scale_px,
-        options: &problem.calibration_options,
-        stop: problem.stop,
-        heartbeat: &|| (),
-    };
+    let reconstruction = (some.cameras.as_slice(), some.points.as_slice());
+    let to_calibrate =
+        problem.uncalibrated(reconstruction, &some.observations, some.noise, &group_of, &focal_priors, &|| ());
     let mut outcomes = calibration::calibrate(&to_calibrate)?;
     if let Some(undone) = &problem.undone {
         for metric in outcomes.iter_mut().filter_map(|outcome| outcome.metric.as_mut()) {

@@ -57,11 +57,6 @@ impl Geometry {
         problem.of_track(track).filter(|&k| is_seen(problem.view_of(k))).collect()
     }
 
-    /// These observations where pinholes would see them.
-    fn observations(&self, problem: &Problem, seen: &[usize]) -> Vec<Observation> {
-        seen.iter().map(|&k| self.observation(problem, k)).collect()
-    }
-
     /// Observation `k` where a pinhole would see it; what a lens images nowhere stays where it is, far from any point.
     pub fn observation(&self, problem: &Problem, k: usize) -> Observation {
         let seen = problem.observation(k);
@@ -87,34 +82,25 @@ pub struct Judged {
     /// Retained observations of each inlier track, with views of the input.
     pub retained: Vec<Vec<Observation>>,
     pub points: Vec<Option<Point>>,
-    /// The other points that linked tracks join, by track.
-    pub splits: Vec<SplitPoint>,
-    /// The points of tracks that two registered views of one component see, by track.
-    pub two_view_points: Vec<TwoViewPoint>,
+    /// The other points that linked tracks join, by track: one wrong link is enough.
+    pub splits: Vec<TrackPoint>,
+    /// The points of tracks that two registered views of one component see and that are more likely right than wrong,
+    /// by track. This verifies nothing: two observations fit a point in three of their four coordinates, and a wrong
+    /// track may be within the noise of the epipolar line by chance.
+    pub two_view_points: Vec<TrackPoint>,
     /// The noise that everything was judged by.
     pub noise: NoiseModel,
 }
 
-/// A point beside its own that a track joins: one wrong link is enough.
-pub struct SplitPoint {
+/// A point that a track shows beside, or in place of, one that is verified.
+pub struct TrackPoint {
     pub track: usize,
-    /// From 1, as [`ObservationResults::split`] has it.
+    /// As [`ObservationResults::split`] has it: 0 for the track's own point, the others from 1.
     pub number: u32,
-    pub weight: f64,
-    pub point: Point,
-    /// The observations that show it.
-    pub retained: Vec<Observation>,
-}
-
-/// The point of a track that two registered views see and that is more likely right than wrong. This verifies nothing:
-/// two observations fit a point in three of their four coordinates, and a wrong track may be within the noise of the
-/// epipolar line by chance.
-pub struct TwoViewPoint {
-    pub track: usize,
     /// Probability that it is right.
     pub weight: f64,
     pub point: Point,
-    /// Its two observations.
+    /// The observations that show it.
     pub retained: Vec<Observation>,
 }
 

@@ -2,7 +2,7 @@
 
 use std::ops::Range;
 
-use super::{Geometry, Judged, OPTIONS, SplitPoint, TwoViewPoint};
+use super::{Geometry, Judged, OPTIONS, TrackPoint};
 use crate::domain::VERIFIED;
 use crate::geometry::observation::Observation;
 use crate::geometry::robust_triangulation::{Triangulator, squared_in_front};
@@ -60,7 +60,7 @@ impl TrackClassifier<'_> {
             .filter(|(_, seen)| seen.len() >= 2)
             .unzip();
         let observations: Vec<Vec<Observation>> =
-            seen.iter().map(|seen| geometry.observations(problem, seen)).collect();
+            seen.iter().map(|seen| seen.iter().map(|&k| geometry.observation(problem, k)).collect()).collect();
         let verdicts = self.judge(&observations.iter().map(Vec::as_slice).collect::<Vec<_>>());
         let found = tracks.into_iter().zip(seen).zip(observations).zip(verdicts);
         found
@@ -116,10 +116,13 @@ impl TrackClassifier<'_> {
             retained.is_some_and(|retained| retained.len() >= self.least_retained(tracks[lane]))
         };
         let found = batch.refine(found, can_be_right, OPTIONS.point_steps);
-        let verdict = |(lane, (observations, retained)): (usize, (&&[Observation], Option<Vec<usize>>))| match retained
-        {
-            Some(retained) => self.weigh(observations, &retained, found.point(lane), found.cost(lane)),
-            None => TrackVerdict::wrong(found.point(lane), observations.len()),
+        let verdict = |(lane, (observations, retained)): (usize, (&&[Observation], Option<Vec<usize>>))| {
+            let point = found.point(lane);
+            match retained {
+                Some(retained) => self.weigh(observations, &retained, point, found.cost(lane)),
+                // No two observations agree on a point in front of their cameras.
+                None => TrackVerdict { weight: 0.0, inlier: false, point, retained: vec![false; observations.len()] },
+            }
         };
         tracks.iter().zip(retained).enumerate().map(verdict).collect()
     }
@@ -130,11 +133,10 @@ impl TrackClassifier<'_> {
         VERIFIED.max((self.least_share * count as f64).ceil() as usize).min(count)
     }
 
-    /// Probability that the track of a point is right by the observations that it retains, and the point, at infinity
-    /// where that fits.
+    /// The verdict on a track by the observations that it retains, with its point at infinity where that fits.
     ///
     /// * `cost`: sum of their weighted squared residuals
-    fn probability(&self, observations: &[Observation], retained: &[usize], point: Point, cost: f64) -> (f64, Point) {
+    fn weigh(&self, observations: &[Observation], retained: &[usize], point: Point, cost: f64) -> TrackVerdict {
         let (point, cost) = self.at_infinity_if_behind(observations, retained, point).unwrap_or((point, cost));
         let dropped = observations.len() - retained.len();
         // The density of a coordinate of weight w is the root of w times as high where the residual is 0, and the point
@@ -143,16 +145,9 @@ impl TrackClassifier<'_> {
         let of_weights = retained.iter().map(|&k| self.given_weight(&observations[k]).ln()).sum::<f64>();
         let of_weights = of_weights * (count - 3.0) / count;
         let ln_odds = self.noise.ln_odds(cost, retained.len(), dropped, self.geometry.inlier_share) + of_weights;
-        let probability = if cost.is_finite() { 1.0 / (1.0 + (-ln_odds).exp()) } else { 0.0 };
-        (probability, point)
-    }
-
-    /// The verdict on a track by the observations that it retains.
-    fn weigh(&self, observations: &[Observation], retained: &[usize], point: Point, cost: f64) -> TrackVerdict {
+        let is_enough = retained.len() >= self.least_retained(observations);
+        let weight = if is_enough && cost.is_finite() { 1.0 / (1.0 + (-ln_odds).exp()) } else { 0.0 };
         let gate = self.noise.gate();
-        let (probability, point) = self.probability(observations, retained, point, cost);
-        let enough = retained.len() >= self.least_retained(observations);
-        let weight = if enough { probability } else { 0.0 };
         let mut flags = vec![false; observations.len()];
         for &k in retained {
             flags[k] = self.seen_squared(&point, &observations[k]) <= gate;
@@ -217,7 +212,7 @@ impl TrackClassifier<'_> {
         let track = *track;
         if observations.len() < VERIFIED {
             let TrackVerdict { weight, point, .. } = *verdict;
-            let found = TwoViewPoint { track, weight, point, retained: observations.clone() };
+            let found = TrackPoint { track, number: 0, weight, point, retained: observations.clone() };
             judged.two_view_points.extend(Some(found).filter(|_| weight > 0.5));
             return;
         }
@@ -241,7 +236,7 @@ impl TrackClassifier<'_> {
             other.observations.iter().for_each(|&k| judged.observations.split[places[k]] = number);
             let TrackVerdict { weight, point, .. } = other.verdict;
             let retained = chosen(observations, &other.observations);
-            judged.splits.push(SplitPoint { track, number, weight, point, retained });
+            judged.splits.push(TrackPoint { track, number, weight, point, retained });
         }
     }
 
@@ -259,13 +254,6 @@ impl TrackClassifier<'_> {
             left = rest;
         }
         others
-    }
-}
-
-impl TrackVerdict {
-    /// On a track of which no two observations agree on a point in front of their cameras.
-    fn wrong(point: Point, observations: usize) -> Self {
-        Self { weight: 0.0, inlier: false, point, retained: vec![false; observations] }
     }
 }
 

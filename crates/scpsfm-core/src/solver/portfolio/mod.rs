@@ -266,8 +266,8 @@ impl<'a> Portfolio<'a> {
     /// Writes the best consensus into the progress.
     fn stand(&self, recorder: &mut Recorder) {
         if let Some(best) = &self.best {
-            recorder.hypothesis.inliers = best.consensus.inlier_count() as u32;
-            recorder.hypothesis.best_cost = Some(best.consensus.score);
+            recorder.progress.inliers = best.consensus.inlier_count() as u32;
+            recorder.progress.best_cost = Some(best.consensus.score);
         }
     }
 

@@ -87,9 +87,9 @@ fn report(problem: &Problem, tracks: &[usize], step: &HeadReport, recorder: &mut
     let iteration = step.head.iteration;
     recorder.begin_step(Task::Heads, step.head.head as usize, step.heads);
     recorder.optimised(step.head, step.losses);
-    recorder.hypothesis.inliers = step.weights.iter().filter(|&&weight| weight > THRESHOLD).count() as u32;
+    recorder.progress.inliers = step.weights.iter().filter(|&&weight| weight > THRESHOLD).count() as u32;
     if settings.use_daq {
-        recorder.hypothesis.focal_px = Some(step.focal * problem.scale_px);
+        recorder.progress.focal_px = Some(step.focal * problem.scale_px);
     }
     let done = f64::from(step.head.head - 1) + f64::from(iteration) / f64::from(settings.iterations);
     recorder.report(done / step.heads as f64);
@@ -193,13 +193,12 @@ impl HeadSearch {
         let objective = self.objective(place);
         let mut head = Head::new(&self.balanced, &self.settings, seed, objective)?;
         let best_daq_residual = self.best().map(|best| best.daq_residual).filter(|_| self.settings.use_daq);
-        let mut all = vec![0.0; self.width];
         while !head.is_finished() {
             if stop.is_stopped() {
                 return Ok(false);
             }
             let step = head.step()?;
-            scatter(head.weights(), &self.columns, &mut all);
+            let weights = self.of_whole(head.weights());
             let progress = HeadProgress {
                 head: place as u32 + 1,
                 iteration: step.iteration,
@@ -210,7 +209,7 @@ impl HeadSearch {
                 best_daq_residual,
             };
             let heads = self.options.heads;
-            report(&HeadReport { head: progress, heads, losses: step.losses, weights: &all, focal: head.focal() });
+            report(&HeadReport { head: progress, heads, losses: step.losses, weights: &weights, focal: head.focal() });
         }
         head.update_weights()?;
         let finished = self.judged(&head);
@@ -220,18 +219,19 @@ impl HeadSearch {
 
     /// Weights of the chosen head, one a column of the whole matrix; 0 where none has ended.
     pub fn weights(&self) -> Vec<f64> {
-        self.weights_of(self.best())
+        self.of_whole(self.best().map_or(&[], |head| &head.weights))
     }
 
     /// Weights of the head that ended last, as [`Self::weights`].
     pub fn latest_weights(&self) -> Vec<f64> {
-        self.weights_of(self.heads.last())
+        self.of_whole(self.heads.last().map_or(&[], |head| &head.weights))
     }
 
-    fn weights_of(&self, head: Option<&FinishedHead>) -> Vec<f64> {
+    /// Weights of the columns with an observation as weights of the whole matrix, 0 elsewhere.
+    fn of_whole(&self, weights: &[f64]) -> Vec<f64> {
         let mut all = vec![0.0; self.width];
-        if let Some(head) = head {
-            scatter(&head.weights, &self.columns, &mut all);
+        for (&column, &weight) in self.columns.iter().zip(weights) {
+            all[column] = weight;
         }
         all
     }
@@ -312,12 +312,5 @@ impl HeadSearch {
     /// Whether the tracks stand apart and are so many that their rank says something.
     fn is_of_low_rank(&self, head: &FinishedHead) -> bool {
         head.is_separate && head.kept >= self.options.accepted_by_rank
-    }
-}
-
-/// Writes the weights of some columns to their places.
-fn scatter(weights: &[f64], columns: &[usize], all: &mut [f64]) {
-    for (&column, &weight) in columns.iter().zip(weights) {
-        all[column] = weight;
     }
 }

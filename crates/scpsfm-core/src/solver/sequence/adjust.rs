@@ -80,15 +80,10 @@ impl Extract {
     }
 
     /// The reconstruction with the groups of its views alone, and the cameras of the problem that these are.
-    pub fn block(&self) -> (MetricReconstruction, Vec<usize>) {
-        let mut reconstruction = self.sequence.clone();
-        let mut cameras = reconstruction.group_of.clone();
-        cameras.sort_unstable();
-        cameras.dedup();
-        reconstruction.intrinsics = cameras.iter().map(|&camera| self.sequence.intrinsics[camera]).collect();
-        for group in &mut reconstruction.group_of {
-            *group = cameras.partition_point(|camera| camera < group);
-        }
+    pub fn block(&self, problem: &Problem) -> (MetricReconstruction, Vec<usize>) {
+        let (group_of, cameras) = problem.cameras_of(&self.views);
+        let intrinsics = cameras.iter().map(|&camera| self.sequence.intrinsics[camera]).collect();
+        let mut reconstruction = MetricReconstruction { intrinsics, group_of, ..self.sequence.clone() };
         reconstruction.average_focals();
         (reconstruction, cameras)
     }
@@ -161,7 +156,7 @@ pub fn around(problem: &Problem, model: &mut Model, view: usize, is_new_lens: bo
     if is_new_lens {
         models[problem.camera_of[view]] = IntrinsicsModel::focal(problem.has_own_focals());
     }
-    let free = Free { models: &models, views: Some(&moves), points: None };
+    let free = Free { models: &models, views: Some(&moves) };
     extract.adjust(problem, model, &free, ADJUSTMENT.iterations_around, recorder);
     if !problem.stop.is_stopped() {
         extract.write_back(model);

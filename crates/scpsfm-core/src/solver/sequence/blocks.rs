@@ -10,13 +10,6 @@ use crate::solver::problem::Problem;
 use crate::solver::recorder::Recorder;
 use crate::solver::view_selection;
 
-/// What came of the blocks of an input.
-pub struct BlocksOutcome {
-    pub ended: Ended,
-    /// Whether nothing else needs to be tried.
-    pub is_settled: bool,
-}
-
 /// Sets of views that a reconstruction may begin with, best first.
 pub struct Blocks {
     pub sets: Vec<Vec<usize>>,
@@ -26,13 +19,7 @@ pub struct Blocks {
 
 impl Blocks {
     pub fn of(problem: &Problem) -> Self {
-        match view_selection::whole(problem) {
-            Some(whole) => Self { sets: vec![whole], is_whole: true },
-            None => {
-                let sets = view_selection::candidate_views_among(problem, &vec![true; problem.views()]);
-                Self { sets, is_whole: false }
-            }
-        }
+        Self { sets: view_selection::candidate_views(problem), is_whole: view_selection::whole(problem).is_some() }
     }
 
     /// Whether the first search does not try everything. In the one block of a whole input depths decide in the first
@@ -41,20 +28,20 @@ impl Blocks {
         !(self.is_whole && problem.input.has_depths())
     }
 
-    /// Calibrates the blocks and extends them from there.
+    /// Calibrates the blocks and extends them from there; with it, whether nothing else needs to be tried.
     pub fn by_calibration(
         &self,
         problem: &Problem,
         is_quick: bool,
         recorder: &mut Recorder,
-    ) -> Result<BlocksOutcome, Error> {
+    ) -> Result<(Ended, bool), Error> {
         let ended = if self.is_whole {
             let attempt = of_whole(problem, &self.sets[0], is_quick, recorder)?;
             // A second search, which tries everything, has the last word. With depths there is one only, and subsets
             // follow.
             let is_last = !is_quick && !problem.input.has_depths() && attempt.projective.is_some();
             if is_last || attempt.is_trusted() || attempt.is_beyond_image_points() {
-                return Ok(BlocksOutcome { ended: finished(problem, attempt, recorder)?, is_settled: true });
+                return Ok((finished(problem, attempt, recorder)?, true));
             }
             match attempt.is_calibrated() {
                 true => metric_of(problem, attempt, recorder)?,
@@ -64,7 +51,7 @@ impl Blocks {
             by_calibrated_blocks(problem, &self.sets, Effort { is_seed: true, is_quick }, recorder)?
         };
         let is_settled = matches!(&ended, Ended::Extended(extended) if extended.is_settled(problem));
-        Ok(BlocksOutcome { ended, is_settled })
+        Ok((ended, is_settled))
     }
 }
 

@@ -2,11 +2,10 @@
 
 use std::cell::RefCell;
 
-use super::adjust::{self, Extract};
-use super::calibrated_views::{core, of_extract, of_view, report_found, take_over, too_few};
+use super::calibrated_views::{calibrate_views, report_found, take_over, too_few};
 use super::model::Model;
 use super::options::StretchOptions;
-use super::{own_focals, structure, windows};
+use super::{adjust, own_focals, structure, windows};
 use crate::domain::{Grade, Task};
 use crate::solver::calibration::Outcome;
 use crate::solver::consensus;
@@ -81,10 +80,14 @@ fn calibrate_registered(
         let of_stretch = |stretch: &Vec<usize>| views.iter().filter(|view| stretch.binary_search(view).is_ok()).count();
         views.is_empty() || stretch.as_ref().is_none_or(|stretch| of_stretch(stretch) >= OPTIONS.least_of_camera)
     };
+    let calibrate_run = |views: &[usize], stretch: Option<&[usize]>, recorder: &mut Recorder| {
+        let recorder = RefCell::new(recorder);
+        calibrate_views(problem, model, views, stretch, &|| recorder.borrow_mut().heartbeat())
+    };
     let mut found = Vec::new();
     if registered.len() >= consensus::LEAST_VIEWS && of_camera.iter().all(holds_enough) {
         recorder.step(Task::Cameras, pass + 1, pass + 1, 0.0);
-        found.push(of_run(problem, model, &registered, stretch.as_deref(), recorder)?);
+        found.push(calibrate_run(&registered, stretch.as_deref(), recorder)?);
     }
     let mut graded = found.iter().flat_map(|(_, outcomes)| outcomes);
     if is_long && problem.cameras > 1 && graded.all(|(_, outcome)| outcome.grade == Grade::ProjectiveOnly) {
@@ -93,7 +96,7 @@ fn calibrate_registered(
         for (k, views) in runs.enumerate() {
             recorder.step(Task::Cameras, pass * problem.cameras + k + 1, (pass + 1) * problem.cameras, 0.0);
             let stretch = (views.len() > OPTIONS.most_views).then(|| densest(problem, model, views));
-            found.push(of_run(problem, model, views, stretch.as_deref(), recorder)?);
+            found.push(calibrate_run(views, stretch.as_deref(), recorder)?);
         }
     }
     let mut outcomes: Vec<Outcome> = of_camera.iter().map(|views| too_few(views.len())).collect();
@@ -113,24 +116,6 @@ fn calibrate_registered(
         }
     }
     Ok(Calibrated { outcomes, focal_moved })
-}
-
-/// The calibrations of the cameras of these views, which have one focal length each, with what they are made from.
-///
-/// * `stretch`: as of [`of_extract`]
-fn of_run(
-    problem: &Problem,
-    model: &Model,
-    views: &[usize],
-    stretch: Option<&[usize]>,
-    recorder: &mut Recorder,
-) -> Result<(Extract, Vec<(usize, Outcome)>), Error> {
-    let extract = core(problem, model, views, of_view(views));
-    let stretch = stretch.map(|stretch| core(problem, model, stretch, of_view(stretch)));
-    let recorder = RefCell::new(recorder);
-    let heartbeat = || recorder.borrow_mut().heartbeat();
-    let found = of_extract(problem, &extract, stretch.as_ref(), model.noise, &heartbeat)?;
-    Ok((extract, found))
 }
 
 /// The run of at most [`StretchOptions::most_views`] of these views that keeps most observations.

@@ -7,7 +7,6 @@ use super::model::Model;
 use super::options::StretchOptions;
 use crate::domain::{FocalPrior, VERIFIED, Warning, WarningCode};
 use crate::geometry::bundle::metric::{Intrinsics, MetricReconstruction};
-use crate::geometry::observation::Observation;
 use crate::geometry::{Camera, Point};
 use crate::solver::calibration::{self, Outcome, Uncalibrated};
 use crate::solver::consensus::LEAST_VIEWS;
@@ -20,31 +19,40 @@ const OPTIONS: StretchOptions = StretchOptions::DEFAULT;
 /// ten-thousandth of its side, a fifth of a pixel of 2,000, which noise covers.
 const OFF_CENTRE: f64 = 0.01;
 
-/// The calibrations of the cameras of some views.
+/// The calibrations of the cameras of some views, with what they are made from.
 ///
-/// * `stretch`: some of them, of the same cameras, where they are many
+/// * `stretch`: some of the views, of the same cameras, where they are many
 /// * `heartbeat`: as of [`Uncalibrated`]
-pub fn of_extract(
+pub fn calibrate_views(
     problem: &Problem,
-    extract: &Extract,
-    stretch: Option<&Extract>,
-    noise: f64,
+    model: &Model,
+    views: &[usize],
+    stretch: Option<&[usize]>,
     heartbeat: &dyn Fn(),
-) -> Result<Vec<(usize, Outcome)>, Error> {
-    let (metric, of_group) = extract.block();
+) -> Result<(Extract, Vec<(usize, Outcome)>), Error> {
+    let block = |views: &[usize]| {
+        let extract = core(problem, model, views, observations_per_view(views));
+        let (metric, of_group) = extract.block(problem);
+        (extract, projective(&metric), metric, of_group)
+    };
+    let (extract, (cameras, points), metric, of_group) = block(views);
     let focal_priors: Vec<Option<FocalPrior>> = of_group.iter().map(|&camera| problem.focal_priors[camera]).collect();
-    let all = ProjectiveExtract::of(&metric);
-    let stretch = stretch.map(|extract| {
-        let (metric, _) = extract.block();
-        (ProjectiveExtract::of(&metric), metric, &extract.observations)
-    });
-    let stretch = stretch.as_ref().map(|(projective, metric, observations)| calibration::Stretch {
-        problem: projective.uncalibrated(problem, metric, observations, &focal_priors, noise, heartbeat),
+    let (observations, group_of) = (&extract.observations, &metric.group_of);
+    let to_calibrate =
+        problem.uncalibrated((&cameras, &points), observations, model.noise, group_of, &focal_priors, heartbeat);
+    let stretch = stretch.map(block);
+    let stretch = stretch.as_ref().map(|(extract, (cameras, points), metric, _)| calibration::Stretch {
+        problem: Uncalibrated {
+            cameras,
+            points,
+            observations: &extract.observations,
+            group_of: &metric.group_of,
+            ..to_calibrate
+        },
         metric,
     });
-    let to_calibrate = all.uncalibrated(problem, &metric, &extract.observations, &focal_priors, noise, heartbeat);
     let outcomes = calibration::from_metric(&to_calibrate, &metric, stretch)?;
-    Ok(of_group.into_iter().zip(outcomes).collect())
+    Ok((extract, of_group.into_iter().zip(outcomes).collect()))
 }
 
 /// Has the model go on from the calibrations of the cameras of some views: their lenses, and where these are all views
@@ -68,57 +76,21 @@ pub fn take_over(model: &mut Model, extract: &mut Extract, found: &[(usize, Outc
 }
 
 /// Observations of each of these views that a calibration is made from.
-pub fn of_view(views: &[usize]) -> usize {
+fn observations_per_view(views: &[usize]) -> usize {
     (OPTIONS.observations / views.len()).clamp(OPTIONS.of_view.0, OPTIONS.of_view.1)
 }
 
 /// The cameras and points of a metric reconstruction without what makes it metric.
-pub struct ProjectiveExtract {
-    cameras: Vec<Camera>,
-    points: Vec<Point>,
-}
-
-impl ProjectiveExtract {
-    pub fn of(metric: &MetricReconstruction) -> Self {
-        let mut cameras = metric.cameras();
-        if metric.has_common_centre {
-            // At one centre the cost is stationary in what parallax would need, a minimum or not: off it, it shows.
-            let aside = |view: usize| Vector3::new(view as f64, 2.0 * view as f64, 3.0 * view as f64).map(f64::sin);
-            cameras.iter_mut().enumerate().for_each(|(view, camera)| camera.set_column(3, &(aside(view) * OFF_CENTRE)));
-        }
-        let nearness = |point: usize| if metric.has_common_centre { OFF_CENTRE * (point as f64).cos() } else { 1.0 };
-        let points = metric.points.iter().enumerate().map(|(k, point)| point.push(nearness(k))).collect();
-        Self { cameras, points }
+pub fn projective(metric: &MetricReconstruction) -> (Vec<Camera>, Vec<Point>) {
+    let mut cameras = metric.cameras();
+    if metric.has_common_centre {
+        // At one centre the cost is stationary in what parallax would need, a minimum or not: off it, it shows.
+        let aside = |view: usize| Vector3::new(view as f64, 2.0 * view as f64, 3.0 * view as f64).map(f64::sin);
+        cameras.iter_mut().enumerate().for_each(|(view, camera)| camera.set_column(3, &(aside(view) * OFF_CENTRE)));
     }
-
-    /// What there is to calibrate.
-    ///
-    /// * `metric`: what these are the cameras and points of
-    /// * `focal_priors`: one a camera group of it
-    pub fn uncalibrated<'a>(
-        &'a self,
-        problem: &'a Problem,
-        metric: &'a MetricReconstruction,
-        observations: &'a [Observation],
-        focal_priors: &'a [Option<FocalPrior>],
-        noise: f64,
-        heartbeat: &'a dyn Fn(),
-    ) -> Uncalibrated<'a> {
-        Uncalibrated {
-            cameras: &self.cameras,
-            points: &self.points,
-            observations,
-            noise,
-            outlier_density: problem.outlier_density,
-            group_of: &metric.group_of,
-            focal_priors,
-            focal_per_view: metric.has_own_focals(),
-            scale_px: problem.scale_px,
-            options: &problem.calibration_options,
-            stop: problem.stop,
-            heartbeat,
-        }
-    }
+    let nearness = |point: usize| if metric.has_common_centre { OFF_CENTRE * (point as f64).cos() } else { 1.0 };
+    let points = metric.points.iter().enumerate().map(|(k, point)| point.push(nearness(k))).collect();
+    (cameras, points)
 }
 
 /// Landmarks that give every one of these registered views `of_view` observations, with the observations that the core

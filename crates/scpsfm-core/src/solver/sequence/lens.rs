@@ -111,77 +111,54 @@ fn undo(problem: &mut Problem, recorder: &mut Recorder) -> Result<bool, Error> {
         let open: Vec<bool> = problem.camera_of.iter().map(|of| *of == camera).collect();
         let sets = view_selection::candidate_views_among(problem, &open);
         let subsets = view_selection::subsets(&sets);
-        let sets: Vec<Vec<usize>> = subsets.into_iter().chain(sets).take(OPTIONS.sets).collect();
-        let of_pinhole: Vec<f64> =
-            sets.iter().map(|views| evidence(problem, views, recorder)).collect::<Result<_, _>>()?;
-        let total_of_pinhole = of_pinhole.iter().sum::<f64>();
-        let seeds: Vec<ComparedViews> =
-            sets.into_iter().zip(of_pinhole).map(|(views, of_pinhole)| ComparedViews { views, of_pinhole }).collect();
+        let seeds: Vec<(Vec<usize>, f64)> = subsets
+            .into_iter()
+            .chain(sets)
+            .take(OPTIONS.sets)
+            .map(|views| evidence(problem, &views, recorder).map(|of_pinhole| (views, of_pinhole)))
+            .collect::<Result<_, _>>()?;
+        let of_pinholes = seeds.iter().map(|(_, of_pinhole)| of_pinhole).sum::<f64>();
         let without = problem.undone.take();
-        let mut best = Best { focal: None, evidence: total_of_pinhole, undone: None };
-        for focal in OPTIONS.focals {
-            best.offer(focal, without.as_ref(), camera, problem, &seeds, recorder)?;
-        }
-        for factor in OPTIONS.refining {
-            let Some(focal) = best.focal else { break };
-            for focal in [focal * factor, focal / factor] {
-                best.offer(focal, without.as_ref(), camera, problem, &seeds, recorder)?;
+        // The equidistant fisheye that explains the seeds best: its focal length, their evidence and what is undone.
+        let mut best: Option<(f64, f64, Undone)> = None;
+        let (mut focals, mut refining) = (OPTIONS.focals.to_vec(), OPTIONS.refining.into_iter());
+        loop {
+            for focal in focals {
+                problem.undone = Undone::new(problem, without.as_ref(), [(camera, Intrinsics::equidistant(focal))]);
+                let found = total_evidence(problem, &seeds, recorder)?.zip(problem.undone.take());
+                let most = best.as_ref().map_or(of_pinholes, |(_, evidence, _)| *evidence);
+                best = found.filter(|(total, _)| *total > most).map(|(total, undone)| (focal, total, undone)).or(best);
             }
+            let Some(((focal, ..), factor)) = best.as_ref().zip(refining.next()) else { break };
+            focals = vec![focal * factor, focal / factor];
         }
-        let least = total_of_pinhole + OPTIONS.least_gain.max(OPTIONS.least_share * total_of_pinhole);
-        problem.undone = best.undone.filter(|_| best.evidence > least).or(without);
+        let least = of_pinholes + OPTIONS.least_gain.max(OPTIONS.least_share * of_pinholes);
+        problem.undone = best.filter(|(_, evidence, _)| *evidence > least).map(|(_, _, undone)| undone).or(without);
     }
     Ok(problem.undone.is_some())
 }
 
-/// Views that a camera's lenses are compared on, with the evidence of their quick seed behind a pinhole.
-struct ComparedViews {
-    views: Vec<usize>,
-    of_pinhole: f64,
-}
-
-/// The lens of a camera that explains its seeds best.
-struct Best {
-    /// `None`: a pinhole does.
-    focal: Option<f64>,
-    /// Of all seeds.
-    evidence: f64,
-    undone: Option<Undone>,
-}
-
-impl Best {
-    /// Takes an equidistant fisheye of this focal length where it is better, and no worse than a pinhole for any seed.
-    /// A seed of few tracks may find another set of them by chance and gain by it, but hardly each seed does.
-    ///
-    /// * `without`: what is undone of other cameras
-    fn offer(
-        &mut self,
-        focal: f64,
-        without: Option<&Undone>,
-        camera: usize,
-        problem: &mut Problem,
-        seeds: &[ComparedViews],
-        recorder: &mut Recorder,
-    ) -> Result<(), Error> {
-        problem.undone = Undone::new(problem, without, [(camera, Intrinsics::equidistant(focal))]);
-        if problem.undone.is_none() {
-            return Ok(());
-        }
-        let mut total = 0.0;
-        for ComparedViews { views, of_pinhole } in seeds {
-            let evidence = evidence(problem, views, recorder)?;
-            if evidence <= of_pinhole - OPTIONS.least_gain {
-                problem.undone = None;
-                return Ok(());
-            }
-            total += evidence;
-        }
-        let undone = problem.undone.take();
-        if total > self.evidence {
-            *self = Self { focal: Some(focal), evidence: total, undone };
-        }
-        Ok(())
+/// Evidence of quick seeds behind the lenses that are undone. `None` where none is, or where a seed is worse than
+/// behind a pinhole: one of few tracks may find another set of them by chance and gain by it, hardly each seed does.
+///
+/// * `seeds`: their views, with the evidence behind a pinhole
+fn total_evidence(
+    problem: &Problem,
+    seeds: &[(Vec<usize>, f64)],
+    recorder: &mut Recorder,
+) -> Result<Option<f64>, Error> {
+    if problem.undone.is_none() {
+        return Ok(None);
     }
+    let mut total = 0.0;
+    for (views, of_pinhole) in seeds {
+        let evidence = evidence(problem, views, recorder)?;
+        if evidence <= of_pinhole - OPTIONS.least_gain {
+            return Ok(None);
+        }
+        total += evidence;
+    }
+    Ok(Some(total))
 }
 
 /// Evidence of a quick seed on these views.

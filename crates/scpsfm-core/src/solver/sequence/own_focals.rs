@@ -26,8 +26,7 @@ pub fn calibrate(problem: &Problem, model: &mut Model, recorder: &mut Recorder) 
     let registered = model.registered();
     let runs = runs(model);
     let of_run = |k: usize, heartbeat: &dyn Fn()| {
-        let extract = calibrated_views::core(problem, model, runs.get(k)?, calibrated_views::of_view(&runs[k]));
-        let found = calibrated_views::of_extract(problem, &extract, None, model.noise, heartbeat).ok()?;
+        let (extract, found) = calibrated_views::calibrate_views(problem, model, runs.get(k)?, None, heartbeat).ok()?;
         found.into_iter().next().map(|(_, outcome)| (extract, outcome))
     };
     let found = if runs.len() == 1 {

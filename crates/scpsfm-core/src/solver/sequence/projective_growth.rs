@@ -4,7 +4,6 @@
 //! It needs no calibration, so it reaches the views where none can be given, and it judges by observation, so a track
 //! with some wrong observations takes part by the others.
 
-use nalgebra::Vector2;
 use rand::SeedableRng;
 use rand_chacha::ChaCha8Rng;
 
@@ -12,7 +11,7 @@ use super::growth::{self, Growth, Trial};
 use super::options::GrowthOptions;
 use crate::domain::VERIFIED;
 use crate::geometry::bundle;
-use crate::geometry::observation::Observation;
+use crate::geometry::observation::{Correspondence, Observation};
 use crate::geometry::robust_triangulation::{self, RobustPoint, Triangulator};
 use crate::geometry::statistics::core_noise;
 use crate::geometry::{Camera, Point, resection};
@@ -262,17 +261,16 @@ impl Growth for Growing<'_> {
     fn register(&mut self, view: usize, seen: &[usize], recorder: &mut Recorder) -> usize {
         let problem = self.problem;
         let datum = |&k: &usize| {
-            let seen = problem.pinhole_observation(k);
-            Some((self.points[problem.track_of(k)]?, (seen.xy, seen.weight)))
+            let Observation { xy, weight, .. } = problem.pinhole_observation(k);
+            Some(Correspondence { point: self.points[problem.track_of(k)]?, xy, weight })
         };
-        let (points, seen): (Vec<Point>, Vec<_>) = seen.iter().filter_map(datum).unzip();
-        let (images, weights): (Vec<Vector2<f64>>, Vec<f64>) = seen.into_iter().unzip();
+        let seen: Vec<_> = seen.iter().filter_map(datum).collect();
         let gate = problem.gate(self.noise);
-        let least = self.options.least_agreeing.max((self.options.least_share * points.len() as f64).ceil() as usize);
-        let found = resection::robust(&points, &images, &weights, gate, least, &mut self.rng, problem.stop);
+        let least = self.options.least_agreeing.max((self.options.least_share * seen.len() as f64).ceil() as usize);
+        let found = resection::robust(&seen, gate, least, &mut self.rng, problem.stop);
         let Some((camera, agrees)) = found else { return 0 };
-        let depths = points.iter().zip(&agrees).filter(|(_, agrees)| **agrees);
-        let sign: f64 = depths.map(|(point, _)| ((camera.row(2) * point).x * point.w).signum()).sum();
+        let points = seen.iter().zip(&agrees).filter(|(_, agrees)| **agrees).map(|(seen, _)| &seen.point);
+        let sign: f64 = points.map(|point| ((camera.row(2) * point).x * point.w).signum()).sum();
         self.cameras[view] = Some(if sign < 0.0 { -camera } else { camera });
         if self.options.gives_points {
             self.triangulate(Some(view), recorder);

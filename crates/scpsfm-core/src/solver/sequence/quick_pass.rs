@@ -1,9 +1,9 @@
 //! In which order seeds are tried: what is cheap first.
 
-use super::blocks::{Blocks, BlocksOutcome};
+use super::blocks::Blocks;
 use super::ended::{Ended, attempt_worth, metric_of};
 use super::options::ExtensionOptions;
-use super::starts::{QUICK_SEED, Start, by_projective_extension, extend_projectively, stands, starts};
+use super::starts::{QUICK_SEED, by_projective_extension, extend_projectively, stands};
 use super::triplets::Pairs;
 use crate::solver::attempt::{self, Attempt};
 use crate::solver::block::Block;
@@ -25,8 +25,7 @@ pub struct QuickPass {
 impl QuickPass {
     pub fn new(problem: &Problem, recorder: &mut Recorder) -> Result<Self, Error> {
         let blocks = Blocks::of(problem);
-        let BlocksOutcome { ended, is_settled } =
-            blocks.by_calibration(problem, blocks.begin_quickly(problem), recorder)?;
+        let (ended, is_settled) = blocks.by_calibration(problem, blocks.begin_quickly(problem), recorder)?;
         Ok(Self { blocks, ended, is_settled })
     }
 
@@ -43,30 +42,31 @@ impl QuickPass {
             return Ok(ended);
         }
         let is_quick = blocks.begin_quickly(problem);
-        // A calibration of few views, than which another answer may be worth more.
-        let (part, first) = match ended.calibrated_extension(problem).is_some() {
+        // A calibration of few views, than which another answer may be worth more. Nothing else is searched of a whole
+        // input with depths: what it has found stands.
+        let (part, found) = match ended.calibrated_extension(problem).is_some() {
             true => (Some(ended), None),
-            false => (None, ended.seed()),
+            false => (None, ended.seed().map(|attempt| (attempt, !is_quick))),
         };
-        let subsets = view_selection::subsets(&blocks.sets);
+        let subsets: Vec<SeedViews> = view_selection::subsets(&blocks.sets).into_iter().map(SeedViews::Block).collect();
         let is_short = blocks.is_whole || part.is_some();
         let first_subsets = if is_short { ExtensionOptions::DEFAULT.first_subsets } else { subsets.len() };
         let cheap = first_subsets.min(subsets.len());
         let (cheap, rest) = subsets.split_at(cheap);
-        // Nothing else is searched of a whole input with depths: what it has found stands.
-        let mut best = by_projective_extension(problem, None, starts(first, !is_quick, cheap), recorder)?;
+        let mut best = by_projective_extension(problem, None, found, cheap, recorder)?;
         let leaves_most = |best: &Attempt| !best.is_good() && best.leaves_most_views(problem);
         if !blocks.is_whole && part.is_none() && best.as_ref().is_none_or(leaves_most) {
             let triplets = view_selection::triplets(problem, &vec![true; problem.views()]);
-            let starts = triplets.into_iter().map(|views| Start::Views(SeedViews::Triplet(views))).collect();
-            best = by_projective_extension(problem, best, starts, recorder)?;
+            let triplets: Vec<SeedViews> = triplets.into_iter().map(SeedViews::Triplet).collect();
+            best = by_projective_extension(problem, best, None, &triplets, recorder)?;
         }
         if is_quick && part.is_none() && !stands(&best) {
-            let BlocksOutcome { ended, is_settled } = blocks.by_calibration(problem, false, recorder)?;
+            let (ended, is_settled) = blocks.by_calibration(problem, false, recorder)?;
             if is_settled || ended.calibrated_extension(problem).is_some() {
                 return Ok(ended);
             }
-            best = by_projective_extension(problem, None, starts(ended.seed(), false, rest), recorder)?;
+            let found = ended.seed().map(|attempt| (attempt, false));
+            best = by_projective_extension(problem, None, found, rest, recorder)?;
         }
         let part_worth = part.as_ref().map_or(f64::NEG_INFINITY, |part| part.worth(problem));
         let found = best.filter(|best| attempt_worth(best, problem) > part_worth);

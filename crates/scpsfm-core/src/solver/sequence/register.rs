@@ -10,7 +10,8 @@ use super::options::{ExtensionOptions, GrowthOptions};
 use super::structure;
 use crate::domain::LeftOut;
 use crate::geometry::bundle::metric::{Intrinsics, Pose};
-use crate::geometry::pose::{self, Correspondences};
+use crate::geometry::observation::Correspondence;
+use crate::geometry::pose;
 use crate::solver::consensus::LEAST_VIEWS;
 use crate::solver::error::Error;
 use crate::solver::problem::Problem;
@@ -130,7 +131,7 @@ impl Growth for Component<'_> {
         structure::triangulate_seen(problem, model, &[view], recorder);
         let registered = model.registered();
         let focal = model.log_focal(problem.camera_of[view], &registered).exp();
-        recorder.hypothesis.focal_px = Some(focal * problem.scale_px);
+        recorder.progress.focal_px = Some(focal * problem.scale_px);
         recorder.registered(registered.len());
         let share = registered.len() as f64 / problem.observed_views().len() as f64;
         recorder.report(EXTENSION.share_of_registering * share);
@@ -141,7 +142,7 @@ impl Growth for Component<'_> {
         adjust::while_growing(self.problem, self.model, self.component, recorder);
         adjust::rescale(self.problem, self.model, self.component);
         structure::triangulate_seen(self.problem, self.model, &self.model.of_component(self.component), recorder);
-        recorder.hypothesis.inliers = adjust::verified(self.model).len() as u32;
+        recorder.progress.inliers = adjust::verified(self.model).len() as u32;
     }
 }
 
@@ -190,15 +191,13 @@ fn robust_pose(
 ) -> Option<(Pose, usize)> {
     let datum = |&k: &usize| {
         let undone = intrinsics.undistorted(&problem.observation(k))?;
-        let ray = intrinsics.pinhole().ray(&undone.xy)?;
-        Some((model.landmarks[problem.track_of(k)]?.position, (ray, undone.weight)))
+        let xy = intrinsics.pinhole().ray(&undone.xy)?;
+        let point = model.landmarks[problem.track_of(k)]?.position;
+        Some(Correspondence { point, xy, weight: undone.weight })
     };
-    let (points, seen): (Vec<_>, Vec<_>) = seen.iter().filter_map(datum).unzip();
-    let (rays, weights): (Vec<_>, Vec<_>) = seen.into_iter().unzip();
+    let seen: Vec<_> = seen.iter().filter_map(datum).collect();
     let gate = problem.gate(model.noise) / intrinsics.focal.powi(2);
-    let robust = if model.has_common_centre { pose::robust_rotation } else { pose::robust };
-    let correspondences = Correspondences { points: &points, seen: &rays, weights: &weights };
-    let found = robust(&correspondences, gate, inliers_to_beat, rng, problem.stop)?;
+    let found = pose::robust(&seen, gate, model.has_common_centre, inliers_to_beat, rng, problem.stop)?;
     Some((found.model, found.inlier_count()))
 }
 

@@ -17,42 +17,30 @@ use crate::solver::view_selection::SeedViews;
 /// How subsets are searched, of which many are tried.
 pub const QUICK_SEED: Effort = Effort { is_seed: true, is_quick: true };
 
-/// What a projective extension begins from.
-pub enum Start {
-    /// What was found already.
-    Found {
-        attempt: Box<Attempt>,
-        /// Whether it stands as it is where its extension leaves too little.
-        keeps: bool,
-    },
-    Views(SeedViews),
-}
-
-/// What was found already, then the blocks of these sets of views.
-pub fn starts(found: Option<Attempt>, keeps: bool, sets: &[Vec<usize>]) -> Vec<Start> {
-    let found = found.map(|attempt| Start::Found { attempt: Box::new(attempt), keeps });
-    found.into_iter().chain(sets.iter().map(|views| Start::Views(SeedViews::Block(views.clone())))).collect()
-}
-
-/// The best of one that stands and of these, each extended to all views without a calibration and, where it is not
-/// known yet, calibrated then; the first that is METRIC. Ends where several of them lead to the same one.
+/// The best of one that stands and of these: what was found already, and what a quick search of these views finds,
+/// each extended to all views without a calibration and calibrated then; the first that is METRIC. Ends where several
+/// of them lead to the same one.
+///
+/// * `found`: with whether it stands as it is where its extension leaves too little
 pub fn by_projective_extension(
     problem: &Problem,
     best: Option<Attempt>,
-    starts: Vec<Start>,
+    mut found: Option<(Attempt, bool)>,
+    views: &[SeedViews],
     recorder: &mut Recorder,
 ) -> Result<Option<Attempt>, Error> {
     let (mut best, mut unsolved) = if stands(&best) { (best, None) } else { (None, best) };
     let mut pairs = Pairs::new(problem);
     let options = ExtensionOptions::DEFAULT;
-    let (count, mut repeated) = (starts.len(), 0);
-    for (k, start) in starts.into_iter().enumerate() {
+    let first = usize::from(found.is_some());
+    let (count, mut repeated) = (first + views.len(), 0);
+    for k in 0..count {
         problem.stopped()?;
-        let (mut attempt, keeps) = match start {
-            Start::Found { attempt, keeps } => (*attempt, keeps),
-            Start::Views(views) => {
+        let (mut attempt, keeps) = match found.take() {
+            Some(found) => found,
+            None => {
                 recorder.begin_block(k, count);
-                (pairs.search(&views, QUICK_SEED, recorder)?, false)
+                (pairs.search(&views[k - first], QUICK_SEED, recorder)?, false)
             }
         };
         extend_projectively(problem, &mut attempt, keeps, recorder)?;

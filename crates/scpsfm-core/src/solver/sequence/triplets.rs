@@ -15,8 +15,7 @@ use crate::geometry::fundamental::{self, Fundamental, Match};
 use crate::geometry::observation::Observation;
 use crate::geometry::robust_triangulation::Triangulator;
 use crate::geometry::statistics::ln_choose;
-use crate::geometry::three_views::{self, FundamentalMatrices};
-use crate::geometry::{Camera, triangulation};
+use crate::geometry::{Camera, three_views, triangulation};
 use crate::solver::a_contrario::FalseAlarmOptions;
 use crate::solver::attempt::{self, Attempt};
 use crate::solver::error::Error;
@@ -73,16 +72,13 @@ impl<'a> Pairs<'a> {
     /// * `views`: increasing
     fn reconstruction(&mut self, views: &[usize; 3]) -> Option<ProjectiveReconstruction> {
         let [first, second, third] = *views;
-        let first_to_second = self.pair(first, second)?;
-        let first_to_third = self.pair(first, third)?;
-        let second_to_third = self.pair(second, third)?;
-        let pairs = [&first_to_second, &first_to_third, &second_to_third];
+        let pairs = [self.pair(first, second)?, self.pair(first, third)?, self.pair(second, third)?];
         let ln_false_alarms: f64 = pairs.iter().map(|pair| pair.ln_false_alarms).sum();
         if ln_false_alarms >= FalseAlarmOptions::DEFAULT.ln_acceptable {
             return None;
         }
         let agrees = |track: &usize| pairs.iter().all(|pair| pair.tracks.binary_search(track).is_ok());
-        let common: Vec<[Vector2<f64>; 3]> = first_to_second
+        let common: Vec<[Vector2<f64>; 3]> = pairs[0]
             .tracks
             .iter()
             .filter(|track| agrees(track))
@@ -91,12 +87,7 @@ impl<'a> Pairs<'a> {
                 Some([a?.xy, b?.xy, c?.xy])
             })
             .collect();
-        let matrices = FundamentalMatrices {
-            first_to_second: &first_to_second.fundamental,
-            first_to_third: &first_to_third.fundamental,
-            second_to_third: &second_to_third.fundamental,
-        };
-        let cameras = three_views::cameras(&matrices, &common)?;
+        let cameras = three_views::cameras(pairs.each_ref().map(|pair| &pair.fundamental), &common)?;
         let mut tracks: Vec<usize> = pairs.iter().flat_map(|pair| pair.tracks.iter().copied()).collect();
         tracks.sort_unstable();
         tracks.dedup();

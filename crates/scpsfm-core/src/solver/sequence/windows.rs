@@ -1,9 +1,8 @@
 //! What windows of a sequence say of each other's focal length.
 
-use super::adjust;
-use super::calibrated_views::{self, ProjectiveExtract};
 use super::model::Model;
 use super::options::WindowOptions;
+use super::{adjust, calibrated_views};
 use crate::domain::Task;
 use crate::solver::calibration::{self, Outcome};
 use crate::solver::error::Error;
@@ -99,9 +98,10 @@ fn estimates(
 /// By how much the log focal length of these views, their mean where each has its own, moves where they are alone.
 fn moved_alone(problem: &Problem, model: &Model, camera: usize, views: &[usize]) -> Option<Estimate> {
     let extract = calibrated_views::core(problem, model, views, OPTIONS.of_view);
-    let (metric, _) = extract.block();
-    let projective = ProjectiveExtract::of(&metric);
-    let to_calibrate = projective.uncalibrated(problem, &metric, &extract.observations, &[None], model.noise, &|| ());
+    let (metric, _) = extract.block(problem);
+    let (cameras, points) = calibrated_views::projective(&metric);
+    let (observations, group_of) = (&extract.observations, &metric.group_of);
+    let to_calibrate = problem.uncalibrated((&cameras, &points), observations, model.noise, group_of, &[None], &|| ());
     let prior = adjust::intrinsics_prior(problem, camera, model.noise);
     let (log_focal, sigma) = calibration::focal_alone(&to_calibrate, &metric, &prior)?;
     Some(Estimate { log_focal: log_focal - metric.log_focal(), sigma })

@@ -20,14 +20,11 @@ const STEPS: usize = 3;
 /// Share of its cost by which a point's last step has to lower it for another to follow.
 const WORTHWHILE: f64 = 1e-2;
 
-/// Moves every free point towards its minimum with the cameras as they are; by how much that lowers the cost. `None`
+/// Moves every point towards its minimum with the cameras as they are; by how much that lowers the cost. `None`
 /// when it was stopped.
 pub(super) fn iterate_points(sequence: &mut MetricReconstruction, loss: Loss, pool: &WorkerPool) -> Option<f64> {
-    let iterated = pool.of_points(|point| {
-        let (seen, position) = (pool.layout.seen(point), sequence.points[point]);
-        let moves = !seen.is_empty() && pool.layout.free_points[point];
-        Some(if moves { iterate(sequence, seen, position, loss) } else { (position, 0.0) })
-    })?;
+    let of_point = |point: usize| Some(iterate(sequence, pool.layout.seen(point), sequence.points[point], loss));
+    let iterated = pool.of_points(of_point)?;
     let mut lowered = 0.0;
     for (slot, (position, by)) in sequence.points.iter_mut().zip(iterated) {
         *slot = position;

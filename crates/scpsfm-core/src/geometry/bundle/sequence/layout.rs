@@ -38,7 +38,8 @@ impl Unknowns {
         let view_block = (0..sequence.poses.len())
             .map(|view| {
                 let unknowns = if own_focal(view) { VIEW } else { POSE };
-                (sees[view] && is_free(free.views, view)).then(|| append(unknowns))
+                let is_free = free.views.is_none_or(|views| views.get(view) == Some(&true));
+                (sees[view] && is_free).then(|| append(unknowns))
             })
             .collect();
         let groups = sequence.intrinsics.len();
@@ -75,11 +76,6 @@ impl Unknowns {
     }
 }
 
-/// A mask frees what it says `true` of; none frees all.
-pub(super) fn is_free(mask: Option<&[bool]>, index: usize) -> bool {
-    mask.is_none_or(|mask| mask.get(index).copied().unwrap_or(false))
-}
-
 /// One observation of a point.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Seen {
@@ -109,7 +105,6 @@ pub(super) struct Layout {
     incident_block_starts: Vec<usize>,
     /// Start of a point's couplings.
     coupling_starts: Vec<usize>,
-    pub free_points: Vec<bool>,
 }
 
 impl Layout {
@@ -134,51 +129,48 @@ impl Layout {
             incident_blocks: Vec::new(),
             incident_block_starts: vec![0],
             coupling_starts: vec![0],
-            free_points: (0..points).map(|point| is_free(free.points, point)).collect(),
         };
         layout.link_blocks(sequence);
         layout
     }
 
-    /// Finds the blocks that each free point is linked with and gives them their places among the couplings.
+    /// Finds the blocks that each point is linked with and gives them their places among the couplings.
     fn link_blocks(&mut self, sequence: &MetricReconstruction) {
         let unknowns = &self.unknowns;
         let mut blocks: Vec<usize> = Vec::new();
         let mut couplings = 0;
-        for point in 0..self.free_points.len() {
+        for point in 0..self.point_count() {
             let seen = &mut self.seen[self.seen_starts[point]..self.seen_starts[point + 1]];
-            if self.free_points[point] {
-                let first = self.incident_blocks.len();
-                let view = |seen: &Seen| unknowns.view_block[seen.view];
-                let group = |seen: &Seen| unknowns.group_block_of_view(sequence, seen.view);
-                blocks.clear();
-                blocks.extend(seen.iter().filter_map(view));
-                blocks.extend(seen.iter().filter_map(group));
-                blocks.sort_unstable();
-                blocks.dedup();
-                let mut size = 0;
-                for &block in &blocks {
-                    self.incident_blocks.push(IncidentBlock { block: block as u32, coupling: size as u32 });
-                    size += POINT * unknowns.range(block).len();
-                }
-                let incident_blocks = &self.incident_blocks[first..];
-                let place = |block: Option<usize>| {
-                    let at = incident_blocks.binary_search_by_key(&(block? as u32), |incident| incident.block).ok()?;
-                    Some(incident_blocks[at].coupling)
-                };
-                for seen in seen {
-                    seen.view_coupling = place(view(seen));
-                    seen.group_coupling = place(group(seen));
-                }
-                couplings += size;
+            let first = self.incident_blocks.len();
+            let view = |seen: &Seen| unknowns.view_block[seen.view];
+            let group = |seen: &Seen| unknowns.group_block_of_view(sequence, seen.view);
+            blocks.clear();
+            blocks.extend(seen.iter().filter_map(view));
+            blocks.extend(seen.iter().filter_map(group));
+            blocks.sort_unstable();
+            blocks.dedup();
+            let mut size = 0;
+            for &block in &blocks {
+                self.incident_blocks.push(IncidentBlock { block: block as u32, coupling: size as u32 });
+                size += POINT * unknowns.range(block).len();
             }
+            let incident_blocks = &self.incident_blocks[first..];
+            let place = |block: Option<usize>| {
+                let at = incident_blocks.binary_search_by_key(&(block? as u32), |incident| incident.block).ok()?;
+                Some(incident_blocks[at].coupling)
+            };
+            for seen in seen {
+                seen.view_coupling = place(view(seen));
+                seen.group_coupling = place(group(seen));
+            }
+            couplings += size;
             self.incident_block_starts.push(self.incident_blocks.len());
             self.coupling_starts.push(couplings);
         }
     }
 
     pub fn point_count(&self) -> usize {
-        self.free_points.len()
+        self.seen_starts.len() - 1
     }
 
     pub fn is_empty(&self) -> bool {
@@ -190,7 +182,7 @@ impl Layout {
         &self.seen[self.seen_starts[point]..self.seen_starts[point + 1]]
     }
 
-    /// Blocks that a point is linked with, ascending; none for a point that is held.
+    /// Blocks that a point is linked with, ascending.
     pub fn incident_blocks(&self, point: usize) -> &[IncidentBlock] {
         &self.incident_blocks[self.incident_block_starts[point]..self.incident_block_starts[point + 1]]
     }
@@ -198,11 +190,6 @@ impl Layout {
     /// Whether a point is linked with any block.
     pub fn is_coupled(&self, point: usize) -> bool {
         !self.incident_blocks(point).is_empty()
-    }
-
-    /// Where the couplings of a point are.
-    pub fn couplings(&self, point: usize) -> Range<usize> {
-        self.coupling_starts[point]..self.coupling_starts[point + 1]
     }
 
     /// Where the couplings of a run of points are.

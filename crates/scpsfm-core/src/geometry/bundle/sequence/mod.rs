@@ -28,21 +28,19 @@ use super::metric::{IntrinsicsModel, MetricReconstruction};
 use crate::domain::StopToken;
 use crate::parallel::Threads;
 
-/// What may move. What a mask is too short for is held.
+/// What may move beside the points.
 #[derive(Debug, Clone, Copy)]
 pub struct Free<'a> {
     /// Free intrinsics, one a group; none are free of a group that is beyond the slice.
     pub models: &'a [IntrinsicsModel],
-    /// Views whose poses are free; `None`: all.
+    /// Views whose poses are free; none are beyond the slice. `None`: all.
     pub views: Option<&'a [bool]>,
-    /// Points that are free; `None`: all.
-    pub points: Option<&'a [bool]>,
 }
 
 impl<'a> Free<'a> {
-    /// All poses and points, and these intrinsics.
+    /// All poses, and these intrinsics.
     pub fn all(models: &'a [IntrinsicsModel]) -> Self {
-        Self { models, views: None, points: None }
+        Self { models, views: None }
     }
 }
 

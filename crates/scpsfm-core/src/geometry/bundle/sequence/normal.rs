@@ -176,7 +176,7 @@ impl Normal {
                     for (point, slot) in points.zip(blocks) {
                         let seen = layout.seen(point);
                         let mut block = PointBlock::ZERO;
-                        let couplings = split_off(&mut couplings, layout.couplings(point).len());
+                        let couplings = split_off(&mut couplings, layout.couplings_of(point..point + 1).len());
                         couplings.fill(0.0);
                         for (seen, slot) in seen.iter().zip(split_off(&mut rows, seen.len())) {
                             let parameters = &layout.unknowns.parameters[sequence.group_of[seen.view]];

@@ -108,7 +108,7 @@ impl Reduced {
                         if incident_blocks.is_empty() {
                             continue;
                         }
-                        let couplings = &normal.couplings[layout.couplings(point)];
+                        let couplings = &normal.couplings[layout.couplings_of(point..point + 1)];
                         let whitened = split_off(&mut whitened, length(point..point + 1));
                         if by_panels {
                             whitened.fill(0.0);
@@ -210,7 +210,7 @@ impl Columns<'_> {
                 return false;
             }
             let incident_blocks = layout.incident_blocks(point);
-            let whitened = &batch.whitened[layout.couplings(point).start - first_coupling..];
+            let whitened = &batch.whitened[layout.couplings_of(point..point + 1).start - first_coupling..];
             let first = incident_blocks.partition_point(|incident| (incident.block as usize) < self.range.start);
             for (k, column) in incident_blocks.iter().enumerate().skip(first) {
                 let block = column.block as usize;
@@ -262,13 +262,13 @@ pub(super) fn substitute(
 ) -> bool {
     let layout = pool.layout;
     let place = |point: usize| {
-        if layout.seen(point).is_empty() || !layout.free_points[point] {
+        if layout.seen(point).is_empty() {
             return Some(from.points[point]);
         }
         let block = &normal.points[point];
         let factor = block.factor(damping)?;
         let mut gradient = block.gradient;
-        let couplings = &normal.couplings[layout.couplings(point)];
+        let couplings = &normal.couplings[layout.couplings_of(point..point + 1)];
         for incident in layout.incident_blocks(point) {
             let step = &step[layout.unknowns.range(incident.block as usize)];
             let coupling = &couplings[incident.coupling as usize..][..POINT * step.len()];

@@ -14,8 +14,8 @@ use crate::domain::{LensProjection, StopReason};
 use crate::geometry::bundle::Loss;
 use crate::geometry::bundle::metric::{Extension, Parameter};
 
-/// Three groups, one of them held, a held view and a held point, unequal weights.
-fn mixed() -> (MetricReconstruction, Vec<Observation>, Vec<IntrinsicsModel>, Vec<bool>, Vec<bool>) {
+/// Three groups, one of them held, a held view, unequal weights.
+fn mixed() -> (MetricReconstruction, Vec<Observation>, Vec<IntrinsicsModel>, Vec<bool>) {
     let (mut sequence, mut observations) = chain(1, 7, 3, 4, 0.003);
     sequence.group_of = vec![0, 0, 1, 1, 2, 2, 0];
     sequence.intrinsics = vec![Intrinsics::from_focal(1.1), Intrinsics::from_focal(0.9), Intrinsics::from_focal(1.3)];
@@ -29,8 +29,7 @@ fn mixed() -> (MetricReconstruction, Vec<Observation>, Vec<IntrinsicsModel>, Vec
     let models =
         vec![IntrinsicsModel::FULL, IntrinsicsModel::FIXED, IntrinsicsModel::FOCAL.with(Extension::PrincipalPoint)];
     let views = (0..7).map(|view| view != 3).collect();
-    let points = (0..sequence.points.len()).map(|point| point != 4).collect();
-    (sequence, observations, models, views, points)
+    (sequence, observations, models, views)
 }
 
 fn laid_out(sequence: &MetricReconstruction, observations: &[Observation], free: &Free) -> (Layout, Pattern) {
@@ -40,7 +39,7 @@ fn laid_out(sequence: &MetricReconstruction, observations: &[Observation], free:
 }
 
 /// Weighted residuals and their derivatives by central differences through the retraction: unknowns of the cameras,
-/// then of the free points.
+/// then of the points.
 fn differentiate(
     sequence: &MetricReconstruction,
     observations: &[Observation],
@@ -74,21 +73,21 @@ fn differentiate(
 
 #[test]
 fn normal_equations_agree_with_finite_differences() {
-    let (sequence, observations, models, views, points) = mixed();
-    compare(&sequence, &observations, &models, &views, &points, 6 * 6 + 9 + 3, "six views, nine and three intrinsics");
+    let (sequence, observations, models, views) = mixed();
+    compare(&sequence, &observations, &models, &views, 6 * 6 + 9 + 3, "six views, nine and three intrinsics");
     // Two views with focal lengths of their own behind one lens.
-    let (mut sequence, mut observations, mut models, views, points) = mixed();
+    let (mut sequence, mut observations, mut models, views) = mixed();
     sequence.focals = vec![1.0, 1.1, 0.9, 1.0, 1.2, 1.3, 1.1];
     models[2] = IntrinsicsModel::FOCAL_PER_VIEW.with(Extension::RadialK1);
     observe(&sequence, &mut observations, 0.003, 1);
-    compare(&sequence, &observations, &models, &views, &points, 6 * 6 + 2 + 9 + 1, "two more unknowns of views");
+    compare(&sequence, &observations, &models, &views, 6 * 6 + 2 + 9 + 1, "two more unknowns of views");
     sequence.intrinsics.iter_mut().for_each(|lens| lens.projection = LensProjection::Fisheye);
     observe(&sequence, &mut observations, 0.003, 1);
-    compare(&sequence, &observations, &models, &views, &points, 6 * 6 + 2 + 9 + 1, "fisheyes");
+    compare(&sequence, &observations, &models, &views, 6 * 6 + 2 + 9 + 1, "fisheyes");
     sequence.intrinsics.iter_mut().for_each(|lens| lens.projection = LensProjection::Perspective);
     observe(&sequence, &mut observations, 0.003, 1);
     models[2] = IntrinsicsModel::FOCAL_PER_VIEW.with_all_extensions();
-    compare(&sequence, &observations, &models, &views, &points, 6 * 6 + 2 + 9 + 8, "all that a lens has");
+    compare(&sequence, &observations, &models, &views, 6 * 6 + 2 + 9 + 8, "all that a lens has");
 }
 
 /// Sparse, square and pair by pair, and by panels.
@@ -134,11 +133,10 @@ fn compare(
     observations: &[Observation],
     models: &[IntrinsicsModel],
     views: &[bool],
-    points: &[bool],
     unknowns: usize,
     what: &str,
 ) {
-    let free = Free { models, views: Some(views), points: Some(points) };
+    let free = Free { models, views: Some(views) };
     let (layout, pattern) = laid_out(sequence, observations, &free);
     let cameras = pattern.dimension();
     assert_eq!(cameras, unknowns, "{what}");
@@ -160,28 +158,21 @@ fn compare(
             close(among[(row, column)], information[(row, column)], "cameras");
         }
     }
-    let mut compared = 0;
     for (point, block) in normal.points.iter().enumerate() {
         let first = cameras + 3 * point;
         let mut coupling = DMatrix::zeros(cameras, 3);
         for incident in layout.incident_blocks(point) {
             let range = layout.unknowns.range(incident.block as usize);
-            let values = &normal.couplings[layout.couplings(point)][incident.coupling as usize..];
+            let values = &normal.couplings[layout.couplings_of(point..point + 1)][incident.coupling as usize..];
             for (k, unknown) in range.clone().enumerate() {
                 (0..3).for_each(|column| coupling[(unknown, column)] = values[column * range.len() + k]);
             }
         }
-        if points[point] {
-            (0..3).for_each(|k| close(block.gradient[k], gradient[first + k], "gradient of a point"));
-            for (row, value) in coupling.column_iter().enumerate() {
-                (0..cameras).for_each(|unknown| close(value[unknown], information[(unknown, first + row)], "coupling"));
-            }
-            compared += 1;
-        } else {
-            assert!(layout.incident_blocks(point).is_empty());
+        (0..3).for_each(|k| close(block.gradient[k], gradient[first + k], "gradient of a point"));
+        for (row, value) in coupling.column_iter().enumerate() {
+            (0..cameras).for_each(|unknown| close(value[unknown], information[(unknown, first + row)], "coupling"));
         }
     }
-    assert_eq!(compared, sequence.points.len() - 1);
 }
 
 #[test]
