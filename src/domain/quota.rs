@@ -50,7 +50,8 @@ impl Quota {
         }
     }
 
-    fn unit(self) -> &'static str {
+    /// What it counts, for sentences.
+    pub fn unit(self) -> &'static str {
         match self {
             Quota::Jobs | Quota::TenantJobs => "jobs",
             Quota::Bytes | Quota::TenantBytes => "bytes of input",

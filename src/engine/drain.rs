@@ -66,21 +66,17 @@ impl Inner {
             pool.others.spawn(super::notifications::run(self.clone()));
         }
         if let Some(options) = &self.options.webhooks {
-            pool.others.spawn(webhooks::task(self, options).map_err(Error::Internal)?);
+            let sender = webhooks::Sender::new(options.clone()).map_err(Error::Internal)?;
+            pool.others.spawn(webhooks::run(self.clone(), Arc::new(sender)));
         }
         *locked(&self.pool) = pool;
         Ok(())
     }
 
-    pub(super) fn attempt_finished(&self) {
+    /// Counts an attempt that is over, where a drain has begun.
+    pub(super) fn count_drained(&self, count: impl FnOnce(&mut Drained)) {
         if self.phase() != Phase::Open {
-            locked(&self.pool).drained.finished += 1;
-        }
-    }
-
-    pub(super) fn attempt_given_back(&self) {
-        if self.phase() != Phase::Open {
-            locked(&self.pool).drained.given_back += 1;
+            count(&mut locked(&self.pool).drained);
         }
     }
 }

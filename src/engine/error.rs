@@ -16,8 +16,11 @@ pub enum Error {
     JobTooLarge { index: usize, oversize: Oversize },
     #[error(transparent)]
     InvalidArgument(#[from] InvalidInput),
-    /// There is no result in this state.
-    #[error("the job is {}, it has no result", .0.name())]
+    /// There is no result in this state, or not yet.
+    #[error("the job is {}; {}", .0.name(), match .0.is_terminal() {
+        true => "it has no result",
+        false => "its result is not ready",
+    })]
     NotReady(JobState),
     /// This server is going down and takes on nothing new; what it was given goes on after its restart.
     #[error("the server is draining")]

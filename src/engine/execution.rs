@@ -18,10 +18,10 @@ use super::observe::{self, Attempt, AttemptLost};
 use super::running::Running;
 use super::worker::{Assignment, AttemptHandle, AttemptOutcome, Started, Worker, failed, stopped};
 use super::{Inner, Phase};
-use crate::domain::job::{Job, JobName, JobState};
+use crate::domain::job::{Job, JobState};
 use crate::domain::{Grade, Progress, StopReason, StopToken};
 use crate::solver;
-use crate::store::{self, Claimed, Claims, Ending, Lease, Outcome, Store};
+use crate::store::{self, Claimed, Claims, Ending, Lease, Outcome};
 
 /// Least time between two stored progress events of a job: twice a second is as fast as people look, and a commit
 /// each is cheap for the disk.
@@ -50,15 +50,6 @@ pub(super) async fn in_time<T>(
 ) -> Result<T, store::Error> {
     let late = |_| Err(store::Error::Unavailable("no answer as long as the lease held".into()));
     timeout_at(until, writing).await.unwrap_or_else(late)
-}
-
-/// The input of a job, with the cancel that may have come before the job was listed as running.
-async fn read(store: Arc<Store>, name: JobName, observations: u32, stop: StopToken) -> Result<Vec<u8>, store::Error> {
-    let payload = store.job_payload(&name, observations).await?;
-    if payload.cancel_requested {
-        stop.stop(StopReason::Cancelled);
-    }
-    Ok(payload.input)
 }
 
 /// An attempt under way.
@@ -228,20 +219,26 @@ impl JobExecution {
     /// none for a prefetched job.
     async fn read_input(&mut self) -> Result<Vec<u8>, AttemptOutcome> {
         loop {
-            let (name, observations) = (self.job.name.clone(), self.job.observation_count);
-            let mut reading = pin!(read(self.inner.store.clone(), name, observations, self.stop.clone()));
+            let (store, name) = (self.inner.store.clone(), self.job.name.clone());
+            let observations = self.job.observation_count;
+            let mut reading = pin!(async move { store.job_payload(&name, observations).await });
             let mut heartbeats = self.heartbeats();
-            let input = loop {
+            let payload = loop {
                 tokio::select! {
                     biased;
-                    input = &mut reading => break input,
+                    payload = &mut reading => break payload,
                     _ = heartbeats.tick(), if self.is_begun() && !self.lost => {
                         self.heartbeat().await;
                     }
                 }
             };
-            match input {
-                Ok(input) if !self.lost => return Ok(input),
+            match payload {
+                Ok(payload) if !self.lost => {
+                    if payload.cancel_requested {
+                        self.stop.stop(StopReason::Cancelled);
+                    }
+                    return Ok(payload.input);
+                }
                 Ok(_) => {}
                 Err(error @ store::Error::Unavailable(_)) => self.store_failed(&error),
                 Err(error) => return Err(failed(error.to_string())),
@@ -404,12 +401,12 @@ impl JobExecution {
                     "job ended"
                 );
                 self.inner.ended(&job);
-                self.inner.attempt_finished();
+                self.inner.count_drained(|drained| drained.finished += 1);
             }
             (Some(_), None) => {
                 tracing::info!("job given back to the queue");
                 observe::attempt_lost(AttemptLost::GivenBack);
-                self.inner.attempt_given_back();
+                self.inner.count_drained(|drained| drained.given_back += 1);
                 self.inner.notifier.wake(&self.job.name);
                 self.inner.queue_changed();
             }

@@ -47,17 +47,12 @@ use crate::parallel::Threads;
 use crate::solver;
 use crate::store::{self, Store};
 
-/// What workers run; [`default_solver`] in earnest, a stand-in in tests.
+/// What workers run; [`solver_on`] in earnest, a stand-in in tests.
 pub type Solver =
     Arc<dyn Fn(&Input, &SolveSettings, &mut dyn Observer, &StopToken) -> Result<Solution, solver::Error> + Send + Sync>;
 
 /// How a result is encoded, once, for all who read it: what it means is theirs to know.
 pub type ResultEncoder = fn(&JobName, &Solution) -> Vec<u8>;
-
-/// The real solver, each job on its worker's thread alone.
-pub fn default_solver() -> Solver {
-    solver_on(Threads::ONE)
-}
 
 /// The real solver, each job on its worker's thread and those that help it. What it finds is the same.
 pub fn solver_on(threads: Threads) -> Solver {
@@ -266,7 +261,7 @@ impl Engine {
         finished(tokio::task::spawn_blocking(checked)).await
     }
 
-    /// What waits and what runs.
+    /// What waits in the queue.
     ///
     /// # Errors
     /// [`Error::Store`].

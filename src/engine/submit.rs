@@ -28,12 +28,6 @@ pub enum JobInput {
     Uploaded(InputName),
 }
 
-impl From<Input> for JobInput {
-    fn from(input: Input) -> Self {
-        JobInput::Inline(input)
-    }
-}
-
 /// What a caller says of a job beside its tenant and its input.
 #[derive(Debug, Clone, Default, PartialEq)]
 pub struct JobDescription {

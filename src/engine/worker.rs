@@ -246,65 +246,6 @@ impl Observer for Reporter {
     }
 }
 
-/// What a worker's thread does, step by step.
 #[cfg(test)]
-pub(super) struct Simulated {
-    reporter: Reporter,
-    stop: StopToken,
-    reply: oneshot::Sender<(AttemptOutcome, Attempt)>,
-}
-
-#[cfg(test)]
-impl Worker {
-    /// Feeds who reads from the inbox.
-    pub(super) fn with_inbox() -> (Self, mpsc::Receiver<Assigned>) {
-        let (assignments, inbox) = mpsc::channel(1);
-        (Self { assignments }, inbox)
-    }
-}
-
-#[cfg(test)]
-impl Assigned {
-    pub(super) fn settings(&self) -> &SolveSettings {
-        &self.assignment.settings
-    }
-
-    /// Begins with it; `None` where nobody wants it any more.
-    pub(super) fn begin(self) -> Option<Simulated> {
-        let Opened { reporter, stop, reply, .. } = self.open()?;
-        Some(Simulated { reporter, stop, reply })
-    }
-}
-
-#[cfg(test)]
-impl Simulated {
-    pub(super) fn name(&self) -> &JobName {
-        &self.reporter.name
-    }
-
-    pub(super) fn is_stopped(&self) -> bool {
-        self.stop.reason().is_some()
-    }
-
-    pub(super) fn report(&mut self, progress: &Progress) {
-        self.reporter.progress(progress);
-    }
-
-    /// Ends with a solution, unless it was stopped.
-    pub(super) fn succeed(self, solution: &Solution, result: Vec<u8>) {
-        let result = EncodedResult::new(result);
-        let summary = summarise(solution, result.bytes.len() as u64);
-        self.end(Some(Outcome::Succeeded { summary, result }));
-    }
-
-    /// Ends with a defect, unless it was stopped.
-    pub(super) fn fail(self) {
-        self.end(failed("told to fail"));
-    }
-
-    fn end(self, end: AttemptOutcome) {
-        let end = self.stop.reason().map_or(end, stopped);
-        // Nobody listens any more where the engine went down.
-        let _ = self.reply.send((end, self.reporter.attempt));
-    }
-}
+#[path = "tests/simulation/worker.rs"]
+mod simulated;

@@ -1,7 +1,6 @@
 //! `CalibrationService`.
 
 use std::pin::Pin;
-use std::time::Duration;
 
 use tokio_stream::{Stream, StreamExt};
 use tonic::{Request, Response, Status, Streaming};
@@ -14,6 +13,7 @@ use super::disconnect::DisconnectTracker;
 use super::inflight::Permit;
 use super::inputs::MAX_CHUNK_BYTES;
 use super::jobs::MAX_BATCH;
+use super::server::Options;
 use super::submission::{self, Submission};
 use super::{proto, status};
 use crate::domain::job::EventBody;
@@ -21,27 +21,22 @@ use crate::domain::{Backend, Limits, Method, SolveSettings};
 use crate::engine::{self, Engine, QueueBounds, UploadOptions};
 use crate::{solver, telemetry};
 
-/// What the transport bounds, as the server tells it.
-#[derive(Debug, Clone, Copy)]
-pub struct Bounds {
-    pub max_message_bytes: usize,
-    pub max_connections: usize,
-}
-
 /// The service.
 #[derive(Clone)]
 pub struct Calibration {
     engine: Engine,
     limits: Limits,
-    bounds: Bounds,
+    max_message_bytes: usize,
+    max_connections: usize,
     disconnects: DisconnectTracker,
 }
 
 impl Calibration {
-    /// `grace`: how long after every `Solve` that is attached to a job was disconnected the job is cancelled.
-    pub fn new(engine: Engine, limits: Limits, bounds: Bounds, grace: Duration) -> Self {
-        let disconnects = DisconnectTracker::new(engine.clone(), grace);
-        Self { engine, limits, bounds, disconnects }
+    /// Of a server with these options.
+    pub fn new(engine: Engine, options: &Options) -> Self {
+        let &Options { max_message_bytes, max_connections, solve_grace, .. } = options;
+        let disconnects = DisconnectTracker::new(engine.clone(), solve_grace);
+        Self { engine, limits: options.limits.clone(), max_message_bytes, max_connections, disconnects }
     }
 
     /// Reads the whole of a stream.
@@ -139,7 +134,7 @@ impl proto::calibration_service_server::CalibrationService for Calibration {
                 max_views: count(self.limits.max_views),
                 max_tracks: count(self.limits.max_tracks),
                 max_observations: count(self.limits.max_observations),
-                max_message_bytes: size_to_wire(self.bounds.max_message_bytes as u64),
+                max_message_bytes: size_to_wire(self.max_message_bytes as u64),
             }),
             methods: Method::ALL.map(Twin::to_wire).to_vec(),
             backends: [Backend::Flex, Backend::Ndarray].map(Twin::to_wire).to_vec(),
@@ -149,7 +144,7 @@ impl proto::calibration_service_server::CalibrationService for Calibration {
             queue_limits: Some(queue_limits(&options.queue)),
             upload_limits: Some(upload_limits(&options.uploads)),
             trained_network_sha256: solver::trained_network_sha256().0.to_vec(),
-            max_connections: count(self.bounds.max_connections),
+            max_connections: count(self.max_connections),
         }))
     }
 }

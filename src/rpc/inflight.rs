@@ -26,11 +26,6 @@ impl Budget {
         Arc::new(Self { max_bytes, used_bytes: Mutex::new(0) })
     }
 
-    #[cfg(test)]
-    pub fn used(&self) -> u64 {
-        *locked(&self.used_bytes)
-    }
-
     /// Takes `after` bytes in place of `before`, both of one call, if they fit. Fewer always do.
     fn exchange(&self, before: u64, after: u64) -> bool {
         let mut used = locked(&self.used_bytes);
@@ -157,6 +152,12 @@ mod tests {
     use tonic_types::StatusExt;
 
     use super::*;
+
+    impl Budget {
+        pub(crate) fn used(&self) -> u64 {
+            *locked(&self.used_bytes)
+        }
+    }
 
     #[test]
     fn what_does_not_fit_is_refused_and_everything_is_given_back() {

@@ -7,6 +7,7 @@ use tonic::{Request, Response, Status, Streaming};
 use tracing::Instrument;
 
 use super::caller::Caller;
+use super::convert::result::digest_from_wire;
 use super::convert::{self, input, size_to_wire};
 use super::inflight::{Permit, WORKING_COPIES};
 use super::upload_reader::{self, UploadReader};
@@ -90,11 +91,8 @@ impl Inputs {
                 return Err(status::violation("start.size_bytes", text));
             }
         };
-        let sha256 = match start.sha256.is_empty() {
-            true => None,
-            false => Some(digest(&start.sha256, "start.sha256")?),
-        };
-        Ok(NewUpload { name, bytes, sha256 })
+        let sha256 = digest_from_wire(&start.sha256, "start.sha256").map_err(status::invalid)?;
+        Ok(NewUpload { name, bytes, sha256: sha256.map(|digest| digest.0) })
     }
 
     /// Makes an input of the bytes that are stored, if they are one.

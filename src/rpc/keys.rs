@@ -28,15 +28,13 @@ const HASHED: &str = "sha256:";
 /// What an entry looks like, for errors.
 const FORM: &str = "TENANT:[SCOPE:]KEY or TENANT:[SCOPE:]sha256:HEX";
 
-type Digest = [u8; 32];
-
-/// What is kept of a key that a caller presented, to see later whether it still stands.
+/// What is kept of a key: its SHA-256.
 #[derive(Clone, PartialEq, Eq, Hash)]
-pub struct Hash(Digest);
+pub struct Hash([u8; 32]);
 
 impl Hash {
     pub fn of(key: &str) -> Self {
-        Self(digest(key.as_bytes()))
+        Self(Sha256::digest(key).into())
     }
 
     /// The first digits of the key's SHA-256, for logs: enough to find its line in a file of keys, and no way back.
@@ -75,7 +73,7 @@ impl Default for Grant {
 /// Keys and what they stand for.
 #[derive(Clone, Default, PartialEq, Eq)]
 pub struct KeyRing {
-    keys: Vec<(Digest, Grant)>,
+    keys: Vec<(Hash, Grant)>,
 }
 
 /// An entry that is none. Says where it stands and what would be right, and nothing of what it holds.
@@ -103,7 +101,7 @@ impl KeyRing {
     fn parse(text: &str) -> Result<Self, Error> {
         let lines = text.lines().map(|line| line.split_once('#').map_or(line, |(entry, _)| entry));
         let entries = lines.flat_map(|line| line.split(',')).map(str::trim).filter(|entry| !entry.is_empty());
-        let mut keys: Vec<(Digest, Grant)> = Vec::new();
+        let mut keys: Vec<(Hash, Grant)> = Vec::new();
         for (k, entry) in entries.enumerate() {
             let parsed = parse(entry).map_err(|problem| Error::Entry { entry: k + 1, problem })?;
             if let Some(first) = keys.iter().position(|(known, _)| *known == parsed.0) {
@@ -125,7 +123,7 @@ impl KeyRing {
     pub fn grant_of_hash(&self, key: &Hash) -> Option<&Grant> {
         let mut found = None;
         for (known, grant) in &self.keys {
-            if bool::from(known.ct_eq(&key.0)) {
+            if bool::from(known.0.ct_eq(&key.0)) {
                 found = Some(grant);
             }
         }
@@ -142,10 +140,6 @@ impl KeyRing {
     }
 }
 
-fn digest(bytes: &[u8]) -> Digest {
-    Sha256::digest(bytes).into()
-}
-
 impl FromStr for KeyRing {
     type Err = Error;
 
@@ -156,7 +150,7 @@ impl FromStr for KeyRing {
     }
 }
 
-fn parse(entry: &str) -> Result<(Digest, Grant), &'static str> {
+fn parse(entry: &str) -> Result<(Hash, Grant), &'static str> {
     let (tenant, key) = entry.split_once(':').ok_or("has no tenant")?;
     // No key contains a colon.
     let (scope, key) = match key.split_once(':') {
@@ -168,11 +162,11 @@ fn parse(entry: &str) -> Result<(Digest, Grant), &'static str> {
     if !JobName::is_id(tenant) {
         return Err("has a tenant that is not 1 to 63 of a-z, 0-9 and -, or begins or ends with -");
     }
-    let digest = match key.strip_prefix(HASHED) {
+    let hash = match key.strip_prefix(HASHED) {
         Some(hex) => from_hex(hex).ok_or("has a hash that is not 64 hexadecimal digits")?,
-        None => digest(checked(key)?.as_bytes()),
+        None => Hash::of(checked(key)?),
     };
-    Ok((digest, Grant { tenant: tenant.to_owned(), scope }))
+    Ok((hash, Grant { tenant: tenant.to_owned(), scope }))
 }
 
 /// A key, if it is one: what a bearer token may hold (RFC 6750, section 2.1).
@@ -190,15 +184,13 @@ pub fn checked(key: &str) -> Result<&str, &'static str> {
     }
 }
 
-fn from_hex(text: &str) -> Option<Digest> {
-    let mut digest = Digest::default();
-    if text.len() != 2 * digest.len() || !text.bytes().all(|byte| byte.is_ascii_hexdigit()) {
+fn from_hex(text: &str) -> Option<Hash> {
+    if text.len() != 64 || !text.bytes().all(|byte| byte.is_ascii_hexdigit()) {
         return None;
     }
-    for (byte, pair) in digest.iter_mut().zip(text.as_bytes().chunks(2)) {
-        *byte = u8::from_str_radix(std::str::from_utf8(pair).ok()?, 16).ok()?;
-    }
-    Some(digest)
+    let half = |digits: &str| u128::from_str_radix(digits, 16).ok().map(u128::to_be_bytes);
+    let halves = [half(&text[..32])?, half(&text[32..])?];
+    halves.as_flattened().try_into().ok().map(Hash)
 }
 
 impl fmt::Debug for KeyRing {
@@ -237,7 +229,7 @@ impl Sources {
         let ring = self.file.as_deref().map(KeyRing::read).transpose()?.unwrap_or_default();
         let Some(fixed) = &self.fixed else { return Ok(ring) };
         let disputed =
-            |(digest, grant): &(Digest, Grant)| fixed.keys.iter().any(|(other, of)| other == digest && of != grant);
+            |(hash, grant): &(Hash, Grant)| fixed.keys.iter().any(|(other, of)| other == hash && of != grant);
         match ring.keys.iter().any(disputed) {
             true => Err("auth.keys and auth.keys_file give one key to two tenants or two scopes".into()),
             false => Ok(ring.with(fixed)),
@@ -272,7 +264,7 @@ mod tests {
 
     #[test]
     fn a_key_stands_for_its_tenant_however_it_is_written() {
-        let hash = digest(B.as_bytes()).map(|byte| format!("{byte:02x}")).concat();
+        let hash = Hash::of(B).0.map(|byte| format!("{byte:02x}")).concat();
         let text = format!("# tenants\nnorth:{A} # the first\n\nsouth:sha256:{hash}\n");
         let ring: KeyRing = text.parse().expect("two keys");
         assert_eq!((ring.tenant_of(A), ring.tenant_of(B)), (Some("north"), Some("south")));
@@ -287,7 +279,7 @@ mod tests {
 
     #[test]
     fn a_scope_stands_between_tenant_and_key() {
-        let hash = digest(B.as_bytes()).map(|byte| format!("{byte:02x}")).concat();
+        let hash = Hash::of(B).0.map(|byte| format!("{byte:02x}")).concat();
         let scope = |entry: &str, key: &str| {
             let ring: KeyRing = entry.parse().expect(entry);
             ring.grant_of_hash(&Hash::of(key)).map(|grant| (grant.tenant.clone(), grant.scope))
@@ -329,7 +321,7 @@ mod tests {
     fn the_hash_of_a_key_is_its_sha256() {
         // FIPS 180-4, of "abc".
         let expected = from_hex("ba7816bf8f01cfea414140de5dae2223b00361a396177a9cb410ff61f20015ad");
-        assert_eq!(Some(digest(b"abc")), expected);
+        assert!(Some(Hash::of("abc")) == expected);
     }
 
     #[test]

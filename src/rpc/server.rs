@@ -21,7 +21,7 @@ use tower::layer::util::{Identity, Stack};
 use super::access_log::RefusalLog;
 use super::admin::Admin;
 use super::auth::Authenticate;
-use super::calibration::{self, Calibration};
+use super::calibration::Calibration;
 use super::call::{CallLayer, CallService};
 use super::health::Health;
 use super::inflight::{Budget, Permit};
@@ -104,12 +104,6 @@ impl Options {
     /// three times), or a thousand small ones, on a machine with a few gigabytes.
     pub const MAX_INFLIGHT_BYTES: u64 = 1 << 30;
 
-    /// See [`listener::MAX_ESTABLISHED`].
-    pub const MAX_CONNECTIONS: usize = listener::MAX_ESTABLISHED;
-
-    /// See [`listener::AUTH_TIMEOUT`].
-    pub const AUTH_TIMEOUT: Duration = listener::AUTH_TIMEOUT;
-
     /// Whether the files of certificates and keys can be used, as they are now.
     ///
     /// # Errors
@@ -136,7 +130,7 @@ impl Default for Options {
             handshake_timeout: listener::HANDSHAKE_TIMEOUT,
             max_silent_connections: listener::MAX_HANDSHAKING,
             max_connections: listener::MAX_ESTABLISHED,
-            auth_timeout: Some(Self::AUTH_TIMEOUT),
+            auth_timeout: Some(listener::AUTH_TIMEOUT),
             keepalive: KEEPALIVE,
             keepalive_timeout: KEEPALIVE_TIMEOUT,
             reflection: true,
@@ -359,8 +353,7 @@ impl Gateway {
 fn services(options: &Options, engine: Engine) -> Result<Routes, Error> {
     let limits = options.limits.clone();
     let max_bytes = options.max_message_bytes;
-    let bounds = calibration::Bounds { max_message_bytes: max_bytes, max_connections: options.max_connections };
-    let calibration = Calibration::new(engine.clone(), limits.clone(), bounds, options.solve_grace);
+    let calibration = Calibration::new(engine.clone(), options);
     let inputs = Inputs::new(engine.clone(), limits.clone());
     let reflection = || {
         tonic_reflection::server::Builder::configure()

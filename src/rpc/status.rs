@@ -12,7 +12,7 @@ use tonic::{Code, Status};
 use tonic_types::{ErrorDetails, FieldViolation, StatusExt};
 
 use super::keys::Scope;
-use crate::domain::job::{JobName, JobState};
+use crate::domain::job::JobName;
 use crate::domain::{InputName, InvalidInput, Oversize, Sha256Digest, Violation};
 use crate::engine::{self, Bound, StoreError, TakenId};
 use crate::telemetry::metrics::RateBound;
@@ -228,15 +228,7 @@ impl From<engine::Error> for Status {
             engine::Error::Store(error) => of_store(error),
             engine::Error::JobTooLarge { oversize, .. } => too_large("JOB_TOO_LARGE", "job", &oversize),
             engine::Error::InvalidArgument(error) => invalid(error),
-            engine::Error::NotReady(state) => {
-                let message = match state {
-                    JobState::Queued | JobState::Running => {
-                        format!("the job is {}; its result is not ready", state.name())
-                    }
-                    _ => format!("the job is {}; it has no result", state.name()),
-                };
-                refused(Code::FailedPrecondition, "RESULT_NOT_READY", message)
-            }
+            engine::Error::NotReady(_) => refused(Code::FailedPrecondition, "RESULT_NOT_READY", error.to_string()),
             engine::Error::Draining => {
                 let details = ErrorDetails::with_retry_info(Some(DRAINING_RETRY));
                 status(Code::Unavailable, "DRAINING", "the server is draining; try another or come back", details)

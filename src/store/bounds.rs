@@ -139,7 +139,7 @@ impl Bound {
 impl fmt::Display for Bound {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         let Self { quota, taken, asked, max } = self;
-        let (full, what) = match quota {
+        let full = match quota {
             Quota::TenantUploads => {
                 let rule = "uploads of the tenant are open: finish one, or let it expire";
                 return write!(f, "{taken} of at most {max} {rule}");
@@ -152,12 +152,9 @@ impl fmt::Display for Bound {
                      or have `upload.tenant_bytes` raised"
                 );
             }
-            Quota::TenantJobs => ("the tenant's share of the queue", "jobs"),
-            Quota::TenantBytes => ("the tenant's share of the queue", "bytes of input"),
-            Quota::Bytes => ("the queue", "bytes of input"),
-            Quota::Observations => ("the queue", "observations"),
-            _ => ("the queue", "jobs"),
+            Quota::TenantJobs | Quota::TenantBytes => "the tenant's share of the queue",
+            _ => "the queue",
         };
-        write!(f, "{full} is full: {what} waiting: {taken}, asked for: {asked}, allowed: {max}")
+        write!(f, "{full} is full: {} waiting: {taken}, asked for: {asked}, allowed: {max}", quota.unit())
     }
 }

@@ -2,11 +2,11 @@
 
 use std::fmt;
 use std::sync::{Arc, Mutex, PoisonError};
-use std::time::{Duration, SystemTime};
+use std::time::SystemTime;
 
 use tokio::time::Instant;
 
-use super::sql::{micros, time};
+use super::sql::{as_micros, micros, time};
 
 /// Differences below this, in microseconds, are the network's, not the clocks': leases last seconds.
 const IN_STEP: i64 = 100_000;
@@ -92,13 +92,10 @@ impl LeaseClock {
     }
 }
 
-fn as_micros(duration: Duration) -> i64 {
-    i64::try_from(duration.as_micros()).unwrap_or(i64::MAX)
-}
-
 #[cfg(test)]
 mod tests {
     use std::sync::atomic::{AtomicI64, Ordering};
+    use std::time::Duration;
 
     use super::*;
 

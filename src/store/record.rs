@@ -75,13 +75,12 @@ pub struct ChangeReply {
     pub by_this_call: bool,
 }
 
-/// What waits and what runs.
+/// What waits in the queue.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
 pub struct QueueStats {
     pub queued: u64,
     pub queued_bytes: u64,
     pub queued_observations: u64,
-    pub running: u64,
     /// Whether claims find nothing of it.
     pub paused: bool,
 }

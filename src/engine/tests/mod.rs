@@ -17,7 +17,7 @@ use std::time::Duration;
 
 use tempfile::TempDir;
 
-use super::{Engine, Error, JobDescription, NewJob, Options, Solver};
+use super::{Engine, Error, JobDescription, JobInput, NewJob, Options, Solver};
 use crate::domain::job::{DEFAULT_TENANT, EventBody, Job, JobEvent, JobName, JobState};
 use crate::domain::{
     Input, Limits, Method, Observer, Progress, RawInput, ReconstructionProgress, Solution, SolveSettings, Stage,
@@ -177,7 +177,7 @@ fn described(description: JobDescription) -> NewJob {
     NewJob {
         tenant: DEFAULT_TENANT.into(),
         description,
-        input: input().into(),
+        input: JobInput::Inline(input()),
         trace_parent: None,
         cancel_on_disconnect: false,
     }

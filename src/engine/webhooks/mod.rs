@@ -14,6 +14,7 @@ use std::time::Duration;
 use tokio::task::{Id, JoinSet};
 use tokio::time::sleep;
 
+pub(super) use send::Sender;
 pub use signature::Secrets;
 
 use super::{Inner, Phase, observe};
@@ -21,7 +22,7 @@ use crate::domain::job::Job;
 use crate::domain::{InvalidInput, Violation, Webhook};
 use crate::store::{self, PassedOver, WebhookOutcome};
 use observe::WebhookAttempt;
-use send::{Failed, Sender};
+use send::Failed;
 
 /// How an ended job is encoded for its receiver. The engine does not know the format.
 pub type JobEncoder = fn(&Job) -> Result<Vec<u8>, String>;
@@ -77,17 +78,8 @@ pub(super) fn check(options: Option<&Options>, tenant: &str, url: &str) -> Resul
     checked.map_err(|error| Violation::of("job.webhook.url", error).into())
 }
 
-/// The task that delivers.
-///
-/// # Errors
-/// As [`Sender::new`].
-pub(super) fn task(inner: &Arc<Inner>, options: &Options) -> Result<impl Future<Output = ()> + use<>, String> {
-    let sender = Arc::new(Sender::new(options.clone())?);
-    Ok(run(inner.clone(), sender))
-}
-
 /// Delivers what is due until the engine is closed. What is under way then is waited for.
-async fn run(inner: Arc<Inner>, sender: Arc<Sender>) {
+pub(super) async fn run(inner: Arc<Inner>, sender: Arc<Sender>) {
     let mut phase = inner.phase.subscribe();
     let mut attempts = Attempts::default();
     while *phase.borrow_and_update() != Phase::Closed {
@@ -158,7 +150,7 @@ impl Attempts {
 async fn attempt(inner: Arc<Inner>, sender: Arc<Sender>, job: Job, webhook: Webhook) {
     let sent = sender.send(&job, &webhook).await;
     let since_end = job.end_time.and_then(|end| inner.now().duration_since(end).ok()).unwrap_or_default();
-    let outcome = outcome(sent, webhook.attempts, since_end, sender.options().retry_for);
+    let outcome = outcome(sent, webhook.attempts, since_end, sender.options.retry_for);
     let noted = inner.store.settle_webhook(&job, &outcome, inner.now()).await;
     let (name, attempts, receiver) = (&job.name, webhook.attempts, webhook.receiver());
     match &outcome {

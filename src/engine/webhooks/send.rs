@@ -53,8 +53,8 @@ impl From<String> for Failed {
 }
 
 /// Makes attempts.
-pub(super) struct Sender {
-    options: Options,
+pub(in crate::engine) struct Sender {
+    pub(super) options: Options,
     tls: TlsConnector,
 }
 
@@ -63,7 +63,7 @@ impl Sender {
     ///
     /// # Errors
     /// TLS cannot be set up: a defect of ours.
-    pub(super) fn new(options: Options) -> Result<Self, String> {
+    pub(in crate::engine) fn new(options: Options) -> Result<Self, String> {
         let mut roots = RootCertStore::empty();
         let found = rustls_native_certs::load_native_certs();
         roots.add_parsable_certificates(found.certs);
@@ -76,10 +76,6 @@ impl Sender {
             .with_root_certificates(roots)
             .with_no_client_auth();
         Ok(Self { options, tls: TlsConnector::from(Arc::new(config)) })
-    }
-
-    pub(super) fn options(&self) -> &Options {
-        &self.options
     }
 
     /// Sends a job that has ended to the receiver of its webhook.

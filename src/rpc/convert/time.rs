@@ -2,7 +2,7 @@
 //! into the seconds, so that a slip would become another time in silence.
 
 use std::ops::RangeInclusive;
-use std::time::{Duration, SystemTime, UNIX_EPOCH};
+use std::time::{Duration, SystemTime};
 
 use prost_types::Timestamp;
 
@@ -24,16 +24,12 @@ const MAX_DURATION_SECONDS: i64 = 3_155_760_000;
 /// # Errors
 /// A violation of `field` for what is no valid `Timestamp`.
 pub(crate) fn time_from_wire(time: Timestamp, field: &str) -> Result<SystemTime, Violation> {
-    let nanos = nanos(time.nanos, field)?;
+    nanos(time.nanos, field)?;
     if !TIME_SECONDS.contains(&time.seconds) {
         let text = format!("{} seconds from 1970 are not in the years 1 to 9999", time.seconds);
         return Err(Violation::of(field, text));
     }
-    let seconds = Duration::from_secs(time.seconds.unsigned_abs());
-    let whole = if time.seconds < 0 { UNIX_EPOCH.checked_sub(seconds) } else { UNIX_EPOCH.checked_add(seconds) };
-    whole
-        .and_then(|whole| whole.checked_add(nanos))
-        .ok_or_else(|| Violation::of(field, "is not a time that this system can represent"))
+    time.try_into().map_err(|_| Violation::of(field, "is not a time that this system can represent"))
 }
 
 /// An optional time from the wire.
@@ -95,6 +91,8 @@ fn nanos(nanos: i32, field: &str) -> Result<Duration, Violation> {
 
 #[cfg(test)]
 mod tests {
+    use std::time::UNIX_EPOCH;
+
     use super::*;
 
     fn time(seconds: i64, nanos: i32) -> Result<SystemTime, Violation> {

@@ -269,6 +269,7 @@ pub(in crate::store) async fn every_outcome_ends_in_its_state(store: &Store) {
         assert_eq!(story(store, &name).await, told(&[(1, 0, "QUEUED"), (2, 1, "RUNNING"), (3, 1, event)]));
     }
     assert_eq!(store.queue_stats().await, Ok(QueueStats::default()));
+    assert_eq!(store.stats().await.expect("counts").tenants, []);
 }
 
 pub(in crate::store) async fn giving_back_is_free_and_vanishing_is_not(store: &Store) {

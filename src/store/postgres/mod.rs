@@ -184,7 +184,7 @@ impl Database for Postgres {
         self.listener.lock().await.next().await
     }
 
-    async fn disconnect(&self) {
+    async fn close(&self) {
         self.listener.lock().await.close().await;
         self.payloads.close().await;
         self.pool.close().await;

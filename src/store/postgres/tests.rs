@@ -114,8 +114,8 @@ async fn many_servers_share_one_queue_and_one_set_of_request_ids() {
     let claims = futures_util::future::join_all(claims).await;
     let claimed = claims.into_iter().filter_map(|claims| claims.expect("claims").begun).map(|claimed| claimed.job.name);
     told_once(claimed.collect());
-    let stats = fixture.queue_stats().await.expect("counts");
-    assert_eq!((stats.queued, stats.running), (0, 10));
+    let tenants = fixture.stats().await.expect("counts").tenants;
+    assert_eq!(tenants.iter().map(|of| (of.queued, of.running)).collect::<Vec<_>>(), [(0, 10)]);
     // And what they lose is taken back once, whoever sweeps.
     let sweeps = servers.iter().map(|server| persistent(move || server.sweep(contract::time(60), 3)));
     let swept = futures_util::future::join_all(sweeps).await;

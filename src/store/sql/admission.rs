@@ -41,9 +41,11 @@ impl dyn Database {
             let mut stats = AdmissionStats::default();
             let mut inputs = vec![None; news.len()];
             if !connection.writes_alone() {
-                // Before anything else, and each name once: two batches of the same inputs in other orders would wait
-                // for each other.
-                connection.lock_inputs(&news.iter().filter_map(uploaded).collect()).await?;
+                // Before anything else, and in one order: two batches of the same inputs in other orders would wait for
+                // each other.
+                for name in news.iter().filter_map(uploaded).collect::<BTreeSet<_>>() {
+                    connection.lock_input(&name).await?;
+                }
                 for (new, input) in news.iter().zip(&mut inputs) {
                     // Payloads take long: nobody else's admission waits for them.
                     let admitted = connection.admit(new, &bounds, &mut stats).await;
@@ -255,7 +257,7 @@ impl AdmissionStats {
     ) -> Result<(QueueStats, QueueStats), Error> {
         let whole = match self.whole {
             Some(whole) => whole,
-            None => connection.queue_stats().await?,
+            None => connection.queue_stats(None).await?,
         };
         self.whole = Some(whole);
         if !bounds.has_tenant_bounds() {
@@ -264,7 +266,7 @@ impl AdmissionStats {
         if let Some(known) = self.tenants.get(tenant) {
             return Ok((whole, *known));
         }
-        let of_tenant = connection.tenant_queue_stats(tenant).await?;
+        let of_tenant = connection.queue_stats(Some(tenant)).await?;
         self.tenants.insert(tenant.to_owned(), of_tenant);
         Ok((whole, of_tenant))
     }

@@ -1,6 +1,5 @@
 //! Uploaded inputs: listed, used by jobs, and removed with what is left of their uploads.
 
-use std::collections::BTreeSet;
 use std::time::SystemTime;
 
 use super::Size::{Payload, Small};
@@ -73,12 +72,7 @@ impl dyn Database {
     /// [`Error::InputNotFound`].
     pub async fn delete_input(&self, name: &InputName) -> Result<(), Error> {
         writes!(self, "delete_input", Payload, Ends(ANY_BYTES), [name], |connection| {
-            let select = Statement::new("SELECT id FROM inputs WHERE tenant = $1 AND input = $2")
-                .bind(&name.tenant)
-                .bind(&name.input)
-                .then(connection.for_update());
-            let row = connection.optional_row(select).await?;
-            let id = row.ok_or_else(|| Error::InputNotFound(name.clone()))?.integer("id")?;
+            let id = connection.lock_input(&name).await?.ok_or_else(|| Error::InputNotFound(name.clone()))?;
             // Those of its upload's parts that are left are removed by and by, as of one that was given up.
             let uploads = [
                 "DELETE FROM uploads WHERE input_id = $1 AND NOT leftover",
@@ -165,16 +159,13 @@ impl dyn Connection + '_ {
         self.find_input(id).await?.ok_or_else(gone)
     }
 
-    /// Locks the rows of these inputs, in one order whoever asks for them; those that are not there are passed over.
-    pub(super) async fn lock_inputs(&mut self, names: &BTreeSet<InputName>) -> Result<(), Error> {
-        for name in names {
-            let select = Statement::new("SELECT id FROM inputs WHERE tenant = $1 AND input = $2")
-                .bind(&name.tenant)
-                .bind(&name.input)
-                .then(self.for_update());
-            self.execute(select).await?;
-        }
-        Ok(())
+    /// Locks the row of an uploaded input, if there is one.
+    pub(super) async fn lock_input(&mut self, name: &InputName) -> Result<Option<i64>, Error> {
+        let select = Statement::new("SELECT id FROM inputs WHERE tenant = $1 AND input = $2")
+            .bind(&name.tenant)
+            .bind(&name.input)
+            .then(self.for_update());
+        self.optional_row(select).await?.map(|row| row.integer("id")).transpose()
     }
 
     /// The row of an uploaded input that a job is about to have; it stays until the transaction ends.

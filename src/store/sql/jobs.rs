@@ -141,9 +141,9 @@ impl dyn Database {
         })
     }
 
-    /// What waits and what runs.
+    /// What waits in the queue.
     pub async fn queue_stats(&self) -> Result<QueueStats, Error> {
-        reads!(self, "load", Page, |connection| connection.queue_stats().await)
+        reads!(self, "load", Page, |connection| connection.queue_stats(None).await)
     }
 
     /// What operators watch.
@@ -179,26 +179,24 @@ impl dyn Connection + '_ {
         row.as_ref().map_or_else(|| Err(Error::NotFound(name.clone())), rows::job)
     }
 
-    /// What waits and what runs.
-    pub(super) async fn queue_stats(&mut self) -> Result<QueueStats, Error> {
+    /// What waits in the queue, of one tenant where it is named.
+    pub(super) async fn queue_stats(&mut self, tenant: Option<&str>) -> Result<QueueStats, Error> {
         // Sums of 64-bit numbers have a wider type of their own in PostgreSQL.
-        let select = Statement::new(
+        let mut select = Statement::new(
             "SELECT COUNT(*) AS queued, CAST(COALESCE(SUM(input_bytes), 0) AS BIGINT) AS bytes, \
              CAST(COALESCE(SUM(observation_count), 0) AS BIGINT) AS observations, \
-             (SELECT COUNT(*) FROM jobs WHERE state = 'RUNNING') AS running, \
              (SELECT pause_time IS NOT NULL FROM queue) AS paused FROM jobs WHERE state = 'QUEUED'",
         );
-        queue_stats_of(&self.row(select).await?)
-    }
-
-    /// What waits of one tenant; what runs is not counted.
-    pub(super) async fn tenant_queue_stats(&mut self, tenant: &str) -> Result<QueueStats, Error> {
-        let select = Statement::new(
-            "SELECT COUNT(*) AS queued, CAST(COALESCE(SUM(input_bytes), 0) AS BIGINT) AS bytes, \
-             CAST(COALESCE(SUM(observation_count), 0) AS BIGINT) AS observations, CAST(0 AS BIGINT) AS running, \
-             FALSE AS paused FROM jobs WHERE state = 'QUEUED' AND tenant = $1",
-        );
-        queue_stats_of(&self.row(select.bind(tenant)).await?)
+        if let Some(tenant) = tenant {
+            select = select.then(" AND tenant = ").then_bind(tenant);
+        }
+        let row = self.row(select).await?;
+        Ok(QueueStats {
+            queued: number(&row, "queued")?,
+            queued_bytes: number(&row, "bytes")?,
+            queued_observations: number(&row, "observations")?,
+            paused: row.flag("paused")?,
+        })
     }
 }
 
@@ -208,14 +206,4 @@ pub(super) fn joined(chunks: &[Row]) -> Result<Vec<u8>, Error> {
         whole.extend(chunk.bytes("data")?);
     }
     Ok(whole)
-}
-
-fn queue_stats_of(row: &Row) -> Result<QueueStats, Error> {
-    Ok(QueueStats {
-        queued: number(row, "queued")?,
-        queued_bytes: number(row, "bytes")?,
-        queued_observations: number(row, "observations")?,
-        running: number(row, "running")?,
-        paused: row.flag("paused")?,
-    })
 }

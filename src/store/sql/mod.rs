@@ -24,7 +24,7 @@ use sqlx::migrate::{Migration, MigrationType, Migrator};
 
 use super::{Error, Notification};
 use crate::domain::FEW_OBSERVATIONS;
-pub(super) use rows::{micros, time};
+pub(super) use rows::{as_micros, micros, time};
 pub(super) use statement::{Row, Statement, Value};
 
 /// A connection to a database, within a transaction or not: unless it says otherwise, one that has the database to
@@ -125,7 +125,9 @@ pub trait Database: Send + Sync + 'static {
     ) -> Result<(), Error>;
 
     /// How long an operation of this size may take; `None`: as long as it does.
-    fn bound(&self, size: Size) -> Option<Duration>;
+    fn bound(&self, _size: Size) -> Option<Duration> {
+        None
+    }
 
     /// The time on the clock that leases run on, where the caller's shows `now`: one clock for every process that holds
     /// or takes back leases, and a steady one.
@@ -154,10 +156,12 @@ pub trait Database: Send + Sync + 'static {
     /// Waits for a change by another process. Notifications may be lost, repeated or stale: whoever handles them looks
     /// into the store, and looks from time to time without one. Never answers where the store is not shared. For one
     /// caller at a time.
-    async fn notification(&self) -> Notification;
+    async fn notification(&self) -> Notification {
+        std::future::pending().await
+    }
 
-    /// Closes every connection.
-    async fn disconnect(&self);
+    /// Closes every connection; what was acknowledged is durable without it.
+    async fn close(&self);
 }
 
 /// What an operation moves.

@@ -107,12 +107,6 @@ impl dyn Database {
     pub(super) async fn finds(&self, select: Statement) -> Result<bool, Error> {
         reads!(self, Size::Page, |connection| connection.row(select).await?.flag("found"))
     }
-
-    /// Closes every connection; what was acknowledged is durable without it.
-    pub async fn close(&self) {
-        let _timer = store_operation("close");
-        self.disconnect().await;
-    }
 }
 
 #[cfg(test)]

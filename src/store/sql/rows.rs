@@ -39,11 +39,15 @@ pub(super) use returning_job;
 
 /// Microseconds since the epoch; times outside of what an `i64` holds are clamped.
 pub(in crate::store) fn micros(time: SystemTime) -> i64 {
-    let after = |duration: Duration| i64::try_from(duration.as_micros()).unwrap_or(i64::MAX);
     match time.duration_since(SystemTime::UNIX_EPOCH) {
-        Ok(since) => after(since),
-        Err(before) => -after(before.duration()),
+        Ok(since) => as_micros(since),
+        Err(before) => -as_micros(before.duration()),
     }
+}
+
+/// Microseconds of a duration, clamped likewise.
+pub(in crate::store) fn as_micros(duration: Duration) -> i64 {
+    i64::try_from(duration.as_micros()).unwrap_or(i64::MAX)
 }
 
 /// The time of [`micros`].

@@ -37,17 +37,7 @@ pub(super) struct Ballast {
     tried: Option<(Instant, String)>,
     /// When its room was last given to others.
     given_up: Option<Instant>,
-    has_room: SpaceFlag,
-}
-
-/// Whether there is room to begin something, for those who ask from other threads.
-#[derive(Debug, Clone)]
-pub(super) struct SpaceFlag(Arc<AtomicBool>);
-
-impl SpaceFlag {
-    pub(super) fn is_set(&self) -> bool {
-        self.0.load(Ordering::Relaxed)
-    }
+    has_room: Arc<AtomicBool>,
 }
 
 impl Ballast {
@@ -55,10 +45,11 @@ impl Ballast {
     pub(super) fn of(directory: &Path) -> Self {
         let path = directory.join(BALLAST_FILE);
         let is_whole = std::fs::metadata(&path).is_ok_and(|file| file.len() == BALLAST_BYTES);
-        Self { path, is_whole, tried: None, given_up: None, has_room: SpaceFlag(Arc::new(AtomicBool::new(true))) }
+        Self { path, is_whole, tried: None, given_up: None, has_room: Arc::new(AtomicBool::new(true)) }
     }
 
-    pub(super) fn space_flag(&self) -> SpaceFlag {
+    /// Whether there is room to begin something, for those who ask from other threads.
+    pub(super) fn space_flag(&self) -> Arc<AtomicBool> {
         self.has_room.clone()
     }
 
@@ -99,7 +90,7 @@ impl Ballast {
                 }
             }
         }
-        self.has_room.0.store(self.is_whole, Ordering::Relaxed);
+        self.has_room.store(self.is_whole, Ordering::Relaxed);
         self.is_whole
     }
 
@@ -169,6 +160,8 @@ mod tests {
     fn what_was_given_up_is_made_again_once_there_is_room() {
         let directory = tempfile::tempdir().expect("a temporary directory");
         let mut ballast = Ballast::of(directory.path());
+        let flag = ballast.space_flag();
+        let has_room = || flag.load(Ordering::Relaxed);
         assert!(ballast.is_due() && length(&ballast).is_none(), "nothing is made before it is asked for");
         assert!(ballast.restore() && ballast.is_whole() && length(&ballast) == Some(BALLAST_BYTES));
         assert!(Ballast::of(directory.path()).is_whole(), "it is found again");
@@ -177,19 +170,14 @@ mod tests {
         // Where its draft should stand is no room.
         let draft = ballast.path.with_extension("reserve.new");
         std::fs::create_dir(&draft).expect("a folder");
-        assert!(ballast.space_flag().is_set(), "it may yet be had back");
+        assert!(has_room(), "it may yet be had back");
         assert!(!ballast.is_due(), "it is for whoever it was given up for");
         ballast.given_up = None;
-        assert!(ballast.is_due() && !ballast.restore() && !ballast.is_whole() && !ballast.space_flag().is_set());
+        assert!(ballast.is_due() && !ballast.restore() && !ballast.is_whole() && !has_room());
         std::fs::remove_dir(&draft).expect("removed");
         assert!(!ballast.is_due() && !ballast.restore(), "not tried again at once");
         ballast.tried = None;
-        assert!(
-            ballast.restore()
-                && ballast.space_flag().is_set()
-                && length(&ballast) == Some(BALLAST_BYTES)
-                && !draft.exists()
-        );
+        assert!(ballast.restore() && has_room() && length(&ballast) == Some(BALLAST_BYTES) && !draft.exists());
     }
 
     #[test]

@@ -133,16 +133,6 @@ impl SqliteConnection {
         &mut self.inner
     }
 
-    /// An empty database in memory.
-    #[cfg(test)]
-    pub(in crate::store) fn in_memory() -> Result<Self, Error> {
-        let connection = rusqlite::Connection::open_in_memory()?;
-        connection.set_prepared_statement_cache_capacity(PREPARED);
-        connection.pragma_update(None, "foreign_keys", "ON")?;
-        connection.execute_batch(super::schema::SCHEMA)?;
-        Ok(Self { inner: connection, database: PathBuf::new() })
-    }
-
     /// Runs a statement to its end and returns its rows.
     pub(super) fn run(&mut self, statement: &Statement) -> Result<Vec<Row>, Error> {
         let mut prepared = self.inner.prepare_cached(statement.sql())?;
@@ -215,7 +205,19 @@ impl From<rusqlite::Error> for Error {
 
 #[cfg(test)]
 mod tests {
+    use super::super::schema::SCHEMA;
     use super::*;
+
+    impl SqliteConnection {
+        /// An empty database in memory.
+        pub(in crate::store) fn in_memory() -> Result<Self, Error> {
+            let connection = rusqlite::Connection::open_in_memory()?;
+            connection.set_prepared_statement_cache_capacity(PREPARED);
+            connection.pragma_update(None, "foreign_keys", "ON")?;
+            connection.execute_batch(SCHEMA)?;
+            Ok(Self { inner: connection, database: PathBuf::new() })
+        }
+    }
 
     #[test]
     fn codes_tell_a_full_disk_and_a_damaged_file() {

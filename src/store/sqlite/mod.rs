@@ -19,12 +19,14 @@ mod writer;
 
 use std::fs::{File, TryLockError};
 use std::path::{Path, PathBuf};
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::{Duration, SystemTime};
 
 use super::clock::LeaseClock;
 use super::sql::{self, Connection, Database, Operation, Size, WriteIntent};
-use super::{Clock, Error, Notification};
-use ballast::{Ballast, SpaceFlag};
+use super::{Clock, Error};
+use ballast::Ballast;
 pub(super) use connection::SqliteConnection;
 use readers::Readers;
 use vacuum::{VACUUM, VACUUM_BYTES, VACUUMS};
@@ -56,7 +58,7 @@ const SETTINGS: [(&str, &str); 4] = [
 #[derive(Debug)]
 pub struct Sqlite {
     writer: Writer,
-    has_room: SpaceFlag,
+    has_room: Arc<AtomicBool>,
     clock: LeaseClock,
     readers: Readers,
     /// The database and its write-ahead log.
@@ -144,10 +146,6 @@ impl Database for Sqlite {
         self.writer.write(intent, sql::operation(move |connection: &mut SqliteConnection| operation(connection))).await
     }
 
-    fn bound(&self, _size: Size) -> Option<Duration> {
-        None
-    }
-
     fn lease_clock(&self, now: SystemTime) -> SystemTime {
         self.clock.translate(now)
     }
@@ -175,14 +173,10 @@ impl Database for Sqlite {
     }
 
     fn has_room(&self) -> bool {
-        self.has_room.is_set()
+        self.has_room.load(Ordering::Relaxed)
     }
 
-    async fn notification(&self) -> Notification {
-        std::future::pending().await
-    }
-
-    async fn disconnect(&self) {
+    async fn close(&self) {
         self.readers.close().await;
         self.writer.close().await;
     }

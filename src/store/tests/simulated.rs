@@ -265,7 +265,7 @@ impl<const SHARED: bool> Database for Simulated<SHARED> {
         }
     }
 
-    async fn disconnect(&self) {}
+    async fn close(&self) {}
 }
 
 /// The one connection, lent to a reader.

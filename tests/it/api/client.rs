@@ -6,7 +6,7 @@ use std::sync::atomic::Ordering;
 use scpsfm::client::{Client, EncodedInput, Error, ErrorKind, JobInput, JobOptions, Options, Setting, ended};
 use scpsfm::domain::job::{EventBody, Job, JobEvent, JobState};
 use scpsfm::domain::{Input, Limits, Method, Silent, Solution, SolveSettings, StopToken, Warning, WarningCode};
-use scpsfm::engine::{Solver, default_solver};
+use scpsfm::engine::Solver;
 use scpsfm::rpc::proto::job_service_client::JobServiceClient;
 use scpsfm::rpc::{proto, server};
 use scpsfm::solver;
@@ -33,7 +33,7 @@ async fn an_uploaded_input_is_solved_as_it_is_in_process() {
     let options = SceneOptions { views: 6, tracks: 60, outliers: 0.3, seed: 5, ..SceneOptions::default() };
     let scene = Scene::generate(&options).expect("a scene");
     let settings = SolveSettings { method: Method::Geometry, ..SolveSettings::default() };
-    let server = TestServer::start(default_solver()).await;
+    let server = TestServer::start(Arc::new(solver::solve)).await;
     let mut client = server.client().await;
 
     let uploaded = client.upload(&EncodedInput::new(&scene.input), &mut |_| ()).await.expect("uploaded");

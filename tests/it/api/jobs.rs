@@ -370,7 +370,7 @@ async fn a_result_is_the_same_bytes_after_a_restart_and_damage_is_found() {
     };
     let first = read(&server).await.expect("a result");
     // With a solver that would make another result: what was stored is what is read.
-    let server = server.restart(scpsfm::engine::default_solver()).await;
+    let server = server.restart(Arc::new(scpsfm::solver::solve)).await;
     assert_eq!(read(&server).await.expect("a result"), first);
     let database = rusqlite::Connection::open(server.directory().join("scpsfm.db")).expect("the database");
     let damaged = database
@@ -433,7 +433,7 @@ async fn a_dash_or_nothing_stands_for_the_callers_tenant() {
 
 #[tokio::test]
 async fn the_names_of_images_come_back() {
-    let server = TestServer::start(scpsfm::engine::default_solver()).await;
+    let server = TestServer::start(Arc::new(scpsfm::solver::solve)).await;
     let mut jobs = server.jobs().await;
     let mut tracks = track_set();
     tracks.views[0].name = "north/IMG_1.jpg".into();

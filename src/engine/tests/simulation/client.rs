@@ -11,7 +11,7 @@ use super::server::Server;
 use crate::domain::SolveSettings;
 use crate::domain::job::{EventBody, JobName, JobState};
 use crate::engine::tests::input;
-use crate::engine::{Engine, Error, JobDescription, NewJob, StoreError};
+use crate::engine::{Engine, Error, JobDescription, JobInput, NewJob, StoreError};
 
 /// Jobs that clients ask for in one simulation at most.
 const MOST_REQUESTS: u64 = 24;
@@ -152,7 +152,7 @@ pub(super) fn request(number: u64) -> NewJob {
     NewJob {
         tenant: format!("tenant-{}", number % 3),
         description,
-        input: input().into(),
+        input: JobInput::Inline(input()),
         trace_parent: None,
         cancel_on_disconnect: false,
     }
