@@ -6,7 +6,7 @@ use std::collections::BTreeSet;
 use nalgebra::Vector2;
 
 use super::block::{self, Block};
-use super::calibration::{CalibrationOptions, Uncalibrated};
+use super::calibration::{CalibrationOptions, Outcome, Uncalibrated};
 use super::consensus::{LEAST_INLIERS, LEAST_VIEWS, NoiseOptions};
 use super::error::Error;
 use super::known_focal::{KnownFocal, known_focal};
@@ -232,6 +232,15 @@ impl<'a> Problem<'a> {
         cameras.dedup();
         let place = |view: &usize| cameras.partition_point(|camera| *camera < self.camera_of[*view]);
         (views.iter().map(place).collect(), cameras)
+    }
+
+    /// As [`Outcome::doubt_implausible`], where the size of the images is known: where it was assumed, so was the place
+    /// of the principal point.
+    pub fn doubt_implausible(&self, outcome: &mut Outcome, found: &Intrinsics, camera: usize) {
+        let is_assumed = self.warnings.iter().any(|warning| warning.code == WarningCode::AssumedImageSize);
+        if !is_assumed {
+            outcome.doubt_implausible(found, self.focal_priors[camera], &self.calibration_options, self.scale_px);
+        }
     }
 
     /// What there is to calibrate of some views.

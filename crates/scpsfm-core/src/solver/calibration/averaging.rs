@@ -22,16 +22,20 @@ pub(super) struct Sigmas {
     pub view_focals: Vec<Option<f64>>,
 }
 
+/// The standard deviation of a log focal length where the observations say less by this factor, and what is known of it
+/// beforehand as much.
+pub(super) fn widened(sigma: f64, factor: f64, known: Option<FocalPrior>) -> f64 {
+    let of_prior = known.map_or(0.0, |known| known.sigma_log.powi(-2));
+    let of_data = (sigma.powi(-2) - of_prior).max(0.0);
+    (of_prior + of_data / factor.powi(2)).powf(-0.5).max(sigma)
+}
+
 impl Sigmas {
     /// The same where the observations say less by this factor, and what is known of focal lengths beforehand as much.
     pub fn widened(mut self, factor: f64, focal_priors: &[Option<FocalPrior>]) -> Self {
         for (of_group, prior) in self.of_group.iter_mut().zip(focal_priors) {
-            let of_prior = prior.map_or(0.0, |prior| prior.sigma_log.powi(-2));
-            let widened = |sigma: f64| {
-                let of_data = (sigma.powi(-2) - of_prior).max(0.0);
-                (of_prior + of_data / factor.powi(2)).powf(-0.5).max(sigma) / sigma
-            };
-            let factor = of_group[Parameter::LogFocal as usize].map_or(factor, widened);
+            let of_focal = of_group[Parameter::LogFocal as usize];
+            let factor = of_focal.map_or(factor, |sigma| widened(sigma, factor, *prior) / sigma);
             of_group.iter_mut().flatten().for_each(|sigma| *sigma *= factor);
         }
         self.view_focals.iter_mut().flatten().for_each(|sigma| *sigma *= factor);

@@ -22,7 +22,9 @@ use nalgebra::{Matrix3x4, Vector4};
 
 use crate::domain::{FocalPrior, Grade, StopToken, Warning, WarningCode};
 use crate::geometry::bundle::critical::Homographies;
-use crate::geometry::bundle::metric::{Intrinsics, IntrinsicsModel, IntrinsicsPrior, MetricReconstruction, Parameter};
+use crate::geometry::bundle::metric::{
+    Extension, Intrinsics, IntrinsicsModel, IntrinsicsPrior, MetricReconstruction, Parameter,
+};
 use crate::geometry::bundle::{Options, projective};
 use crate::geometry::daq::to_canonical_frame;
 use crate::geometry::observation::{self, Observation};
@@ -162,27 +164,40 @@ impl Outcome {
     /// Raises the standard deviation of a calibration whose principal point and aspect are implausible, and says so.
     ///
     /// Wrong observations may fit such a camera, and determine it well. What is known of cameras and what the
-    /// observations say contradict each other then, and sigma grows by Birge's ratio, as where the caller's prior does
-    /// that: cropped images whose calibration is well determined keep it. Asked twice, it grows once.
+    /// observations say contradict each other then, and what these say counts less by Birge's ratio, as where the
+    /// caller's prior is contradicted: cropped images whose calibration is well determined keep it. Asked twice, it
+    /// grows once. With a focal length a view it is larger already by what lenses differ at other focal lengths.
     ///
     /// * `found`: intrinsics of the group
-    pub fn doubt_implausible(&mut self, found: &Intrinsics, options: &CalibrationOptions, scale_px: f64) {
+    /// * `known`: what is known of its focal length beforehand
+    pub fn doubt_implausible(
+        &mut self,
+        found: &Intrinsics,
+        known: Option<FocalPrior>,
+        options: &CalibrationOptions,
+        scale_px: f64,
+    ) {
         let deviations = options.lenses.deviations(self.model, found);
-        let calibrated = self.sigma_log_focal.filter(|_| self.grade != Grade::ProjectiveOnly);
+        let is_calibrated = self.grade != Grade::ProjectiveOnly && self.focals.is_none();
+        let calibrated = self.sigma_log_focal.filter(|_| is_calibrated);
         let (Some(sigma), Some(ratio)) = (calibrated, root_mean_square(&deviations)) else { return };
         if deviations.len() as f64 * ratio.powi(2) <= options.models.significant_gain(deviations.len()) {
             return;
         }
+        let aspect = match self.model.contains(Extension::Aspect) {
+            true => format!(" and pixels of aspect {:.3}", found.aspect),
+            false => String::new(),
+        };
         let detail = format!(
-            "the camera that fits best has its principal point {:.0} px from where it is expected and pixels of aspect \
-             {:.3}, {ratio:.1} times as far off as is usual; sigma is as much larger",
+            "the camera that fits best has its principal point {:.0} px from where it is expected{aspect}, {ratio:.1} \
+             times as far off as is usual; what the tracks say of it counts as much less: cropped or stretched images, \
+             a wrong image size, or wrong tracks",
             found.principal_point.norm() * scale_px,
-            found.aspect
         );
         let warning = Warning::new(WarningCode::ModelMismatch, detail);
         if !self.warnings.contains(&warning) {
             self.warnings.push(warning);
-            self.raise_sigma(ratio * sigma, &options.grades);
+            self.raise_sigma(averaging::widened(sigma, ratio, known), &options.grades);
         }
     }
 

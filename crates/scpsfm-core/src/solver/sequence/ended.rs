@@ -5,6 +5,7 @@ use super::options::ExtensionOptions;
 use super::starts::extend_projectively;
 use crate::domain::{Grade, Stage};
 use crate::solver::attempt::{self, Attempt};
+use crate::solver::calibration::Outcome;
 use crate::solver::error::Error;
 use crate::solver::noise_model;
 use crate::solver::problem::Problem;
@@ -105,12 +106,14 @@ pub fn attempt_worth(attempt: &Attempt, problem: &Problem) -> f64 {
     worth(attempt.evidence(problem), attempt.is_calibrated())
 }
 
-/// See [`Outcome::doubt_implausible`](crate::solver::calibration::Outcome::doubt_implausible).
+/// See [`Problem::doubt_implausible`].
 fn doubt(problem: &Problem, attempt: &mut Attempt) {
+    let Some(intrinsics) = attempt.calibration.as_ref().and_then(Outcome::intrinsics) else { return };
+    let (_, cameras) = problem.cameras_of(attempt.views());
     if let Some(outcome) = &mut attempt.calibration
-        && let Some(intrinsics) = outcome.intrinsics()
+        && let Some(&camera) = cameras.get(outcome.group)
     {
-        outcome.doubt_implausible(&intrinsics, &problem.calibration_options, problem.scale_px);
+        problem.doubt_implausible(outcome, &intrinsics, camera);
     }
 }
 

@@ -66,8 +66,8 @@ pub fn extend(problem: &Problem, seed: Attempt, recorder: &mut Recorder) -> Resu
         );
         calibrations.iter_mut().for_each(|outcome| refuse(outcome, detail.clone()));
     }
-    for (outcome, lens) in calibrations.iter_mut().zip(&model.lenses) {
-        outcome.doubt_implausible(&lens.intrinsics, &problem.calibration_options, problem.scale_px);
+    for (camera, (outcome, lens)) in calibrations.iter_mut().zip(&model.lenses).enumerate() {
+        problem.doubt_implausible(outcome, &lens.intrinsics, camera);
     }
     for (outcome, magnification) in calibrations.iter_mut().zip(magnifications(problem, &model)) {
         if outcome.grade != Grade::ProjectiveOnly && magnification > OPTIONS.most_magnification {

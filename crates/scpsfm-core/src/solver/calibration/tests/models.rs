@@ -40,13 +40,19 @@ fn an_implausible_camera_is_less_certain() {
             let before = calibrated(&scene, seed, noise);
             let mut after = before.clone();
             // Asked twice, it doubts once.
-            (0..2).for_each(|_| after.doubt_implausible(&before.intrinsics().expect("metric"), &options, SIDE_PX));
+            let found = before.intrinsics().expect("metric");
+            (0..2).for_each(|_| after.doubt_implausible(&found, None, &options, SIDE_PX));
             let ratio = after.sigma_log_focal.expect("determined") / before.sigma_log_focal.expect("determined");
             println!("seed {seed}, {deviations} at {noise}: {ratio}, {:?}, {:?}", after.grade, codes(&after));
             assert_eq!((before.grade, after.grade == Grade::Metric), (Grade::Metric, is_metric), "seed {seed}");
             let expected = if deviations > 3.0 { deviations * 0.5f64.sqrt() } else { 1.0 };
             assert!((ratio / expected - 1.0).abs() < 0.1, "seed {seed}: {ratio} for {expected}");
             assert_eq!(codes(&after).contains(&"MODEL_MISMATCH"), expected > 1.0, "seed {seed}");
+            // A focal length that is known beforehand is no less known.
+            let focal_prior = FocalPrior { focal_px: found.focal * SIDE_PX, sigma_log: 1e-3 };
+            let mut known = Outcome { sigma_log_focal: Some(0.9e-3), ..before };
+            known.doubt_implausible(&found, Some(focal_prior), &options, SIDE_PX);
+            assert!(known.sigma_log_focal < Some(1e-3), "seed {seed}: {:?}", known.sigma_log_focal);
         }
     }
 }
