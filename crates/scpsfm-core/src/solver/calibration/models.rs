@@ -230,9 +230,10 @@ impl Uncalibrated<'_> {
     /// Fisheyes in the place of wide barrels become the best where the chi-square falls by a significant gain for the
     /// other projection and for each parameter more. It may rise by as much for each parameter fewer: the two series of
     /// distortion are not nested. Perspective lenses in the place of fisheyes only take part in sigma: the observations
-    /// are those that fit behind the fisheye.
+    /// are those that fit behind the fisheye. One that images no more than a perspective lens does is none: it took its
+    /// focal length from the distortion of that.
     ///
-    /// * `minima`: others, put behind fisheyes where those become the best
+    /// * `minima`: others, put behind the same lenses as the best
     /// * `warnings`: those of the best are added
     pub(super) fn select_of_any_projection(
         &self,
@@ -240,9 +241,29 @@ impl Uncalibrated<'_> {
         minima: &mut [Minimum],
         warnings: &mut Vec<Warning>,
     ) -> Result<Selection, Error> {
+        let ModelOptions { fisheye_from, perspective_up_to, significant_gain_of_one, .. } = self.options.models;
+        let perspective = |radii: &[Option<f64>], group: usize, lens: &Intrinsics| {
+            radii[group].map_or(*lens, |radius| lens.nearest_perspective(radius))
+        };
+        let in_perspective = |of: &Candidate, radii: &[Option<f64>]| {
+            let radial = [Extension::RadialK1, Extension::RadialK2, Extension::RadialK3];
+            let model = radial.into_iter().fold(of.model, IntrinsicsModel::with);
+            let start = of.minimum.with_lenses(|group, lens| perspective(radii, group, lens));
+            self.adjusted(start.reconstruction, model, of.fit.noise)
+        };
+        let is_no_fisheye = |lens: &Intrinsics, radius: f64| lens.is_fisheye() && radius <= fisheye_from;
+        let from = match self.radii(&from.minimum.reconstruction, is_no_fisheye) {
+            Some(radii) => {
+                let replaced = |minimum: &mut Minimum| {
+                    *minimum = minimum.with_lenses(|group, lens| perspective(&radii, group, lens));
+                };
+                minima.iter_mut().for_each(replaced);
+                in_perspective(&from, &radii)
+            }
+            None => from,
+        };
         let mut of_model = Vec::new();
         let mut found = self.select(from, &mut of_model)?;
-        let ModelOptions { fisheye_from, perspective_up_to, significant_gain_of_one, .. } = self.options.models;
         let best = &found.best;
         let may_be_fisheye =
             |lens: &Intrinsics, radius: f64| !lens.is_fisheye() && lens.radial[0] < 0.0 && radius > fisheye_from;
@@ -271,12 +292,7 @@ impl Uncalibrated<'_> {
         }
         let may_be_perspective = |lens: &Intrinsics, radius: f64| lens.is_fisheye() && radius < perspective_up_to;
         if let Some(radii) = self.radii(&best.minimum.reconstruction, may_be_perspective) {
-            let from = best
-                .minimum
-                .with_lenses(|group, lens| radii[group].map_or(*lens, |radius| lens.nearest_perspective(radius)));
-            let radial = [Extension::RadialK1, Extension::RadialK2, Extension::RadialK3];
-            let model = radial.into_iter().fold(best.model, IntrinsicsModel::with);
-            let other = self.adjusted(from.reconstruction, model, best.fit.noise);
+            let other = in_perspective(best, &radii);
             found.tried.push(other);
         }
         warnings.extend(of_model);

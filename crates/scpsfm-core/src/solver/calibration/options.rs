@@ -297,8 +297,8 @@ options! {
         sigma_inflation: f64 = 3.0,
         /// Shift of the log focal length between models, in standard deviations, that speaks of a wrong model.
         model_shift: f64 = 3.0,
-        /// Radius at unit depth that a barrel's images must exceed for a fisheye to be tried in its place. 35 degrees:
-        /// up to there three radial terms image an equidistant fisheye to 2e-5 of a focal length.
+        /// Radius at unit depth that a fisheye's images must exceed, and a barrel's for a fisheye to be tried in its
+        /// place. 35 degrees: up to there three radial terms image an equidistant fisheye to 2e-5 of a focal length.
         fisheye_from: f64 = 0.7,
         /// Radius at unit depth up to which a perspective lens may stand for a fisheye. 60 degrees: there three radial
         /// terms leave a root mean square of .8 px in an image 1,600 px wide of 120 degrees, with every five degrees more
