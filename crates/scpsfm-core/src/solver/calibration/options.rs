@@ -123,7 +123,9 @@ options! {
         /// with a focal length a view begin from those with one for all.
         first_iterations: usize = 12,
         first_tolerance: f64 = 1e-4,
-        /// Starts that are adjusted to convergence, and the iterations and the tolerance allowed.
+        /// Starts that are adjusted to convergence, and the iterations and the tolerance allowed. An end where a step
+        /// gains less than .003 of chi-square takes a sixth less time, and gave two of 120 scenes a wrong focal length:
+        /// flat valleys may end in a fall.
         converged: usize = 3,
         final_iterations: usize = 60,
         final_tolerance: f64 = 1e-9,

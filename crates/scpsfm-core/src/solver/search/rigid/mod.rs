@@ -7,12 +7,10 @@
 //! two hundred. Depths from epipolar geometry are true only up to a scale a view and a track: there nothing is
 //! rigid, and the other searches remain.
 
-mod golden;
 mod graph;
 
 use nalgebra::Vector3;
 
-use golden::golden_section;
 use graph::{Graph, Pair};
 
 use super::options::RigidOptions;
@@ -324,6 +322,26 @@ impl<'a> RigidSearch<'a> {
     }
 }
 
+/// Minimum of a function near `middle`, by golden section over `middle +- half_width`.
+pub fn golden_section(cost: impl Fn(f64) -> f64, middle: f64, half_width: f64, steps: usize) -> f64 {
+    let ratio = (5f64.sqrt() - 1.0) / 2.0;
+    let (mut low, mut high) = (middle - half_width, middle + half_width);
+    let (mut left, mut right) = (high - ratio * (high - low), low + ratio * (high - low));
+    let (mut cost_left, mut cost_right) = (cost(left), cost(right));
+    for _ in 0..steps {
+        if cost_left < cost_right {
+            (high, right, cost_right) = (right, left, cost_left);
+            left = high - ratio * (high - low);
+            cost_left = cost(left);
+        } else {
+            (low, left, cost_left) = (left, right, cost_right);
+            right = low + ratio * (high - low);
+            cost_right = cost(right);
+        }
+    }
+    (low + high) / 2.0
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -364,5 +382,11 @@ mod tests {
             let (_, _, certainty) = found(&options);
             assert!(certainty > FalseAlarmOptions::DEFAULT.ln_decisive / 4.0, "seed {seed}: {certainty}");
         }
+    }
+
+    #[test]
+    fn the_golden_section_finds_a_minimum() {
+        let found = golden_section(|x| (x - 0.3).powi(2), 0.2, 0.5, 30);
+        assert!((found - 0.3).abs() < 1e-5, "{found}");
     }
 }

@@ -5,21 +5,49 @@
 //! tracks under the gate stands still. Then a polish: the gate inflated and tightened again, which frees consensuses
 //! that grew into a corner (mean F1 .90 -> 1.00 at 90 % outliers). [`refine`] settles the noise of the result.
 
-mod noise;
-mod options;
-
-pub use noise::{estimate_noise, refine};
-use options::GrowingOptions;
-
-use super::consensus::{Consensus, ConsensusOptions, LEAST_SUPPORT, gate, judge, observations_of};
+use super::a_contrario;
+use super::consensus::{
+    Consensus, ConsensusOptions, LEAST_INLIERS, LEAST_SUPPORT, NoiseOptions, constraint_count, gate, judge,
+    observations_of,
+};
 use super::search::Seed;
 use crate::domain::StopToken;
 use crate::geometry::bundle::{self, Loss, projective};
 use crate::geometry::measurement::CompleteBlock;
+use crate::geometry::statistics::{chi_square_median, median};
 use crate::geometry::{Camera, Point};
+
+options! {
+    /// How a seed grows to a consensus.
+    pub struct GrowingOptions {
+        /// Rounds of growing at most, and those without a better consensus after which it ends. A true seed needs five
+        /// to ten.
+        rounds: usize = 30,
+        idle_rounds: usize = 3,
+        /// Bundle adjustment iterations of the first rounds, how many rounds these are, and iterations of the later
+        /// ones.
+        first_iterations: usize = 12,
+        first_rounds: usize = 3,
+        /// They start close to the optimum.
+        later_iterations: usize = 8,
+        /// Supports up to this size are fitted without a robust loss. There is nothing to spare yet.
+        plain_support: usize = 8,
+        /// Growth of the support while the gate admits more tracks than it holds, and while it does not.
+        fast_growth: f64 = 1.5,
+        careful_growth: f64 = 1.15,
+        /// Share of the support that the gate must admit for the support to become what it admits.
+        caught_up: f64 = 0.8,
+        /// Gates within which the next track must lie for a support to grow that the gate does not confirm.
+        near_gates: f64 = 30.0,
+        /// Inflations of the gate while polishing, and how often they are gone through.
+        polish_inflations: [f64; 6] = [8.0, 4.0, 2.0, 1.0, 1.0, 1.0],
+        polish_rounds: usize = 2,
+    }
+}
 
 const OPTIONS: GrowingOptions = GrowingOptions::DEFAULT;
 const CONSENSUS: ConsensusOptions = ConsensusOptions::DEFAULT;
+const NOISE: NoiseOptions = NoiseOptions::DEFAULT;
 
 /// Fits at one noise level, and where those ended that converged: the same support under the same loss ends there
 /// again, so that it is looked up instead.
@@ -172,4 +200,51 @@ fn next_support(judged: &Consensus, size: usize, views: usize) -> Vec<usize> {
     ranked.truncate(wanted);
     ranked.sort_unstable();
     ranked
+}
+
+/// Estimates the noise from the inliers and refits until both agree.
+///
+/// The estimate is `median(r^2) / median of chi-square`, with the degrees of freedom that cameras and points leave to
+/// a track, so a few wrong tracks among the inliers do not move it. Starting high is safe, starting low is not: a gate
+/// that is too narrow loses the scene.
+fn settle_noise(block: &CompleteBlock, consensus: Consensus, stop: &StopToken) -> Consensus {
+    let mut current = consensus;
+    for _ in 0..NOISE.rounds {
+        let inliers = current.inliers();
+        if inliers.len() < LEAST_INLIERS || stop.is_stopped() {
+            break;
+        }
+        let noise = estimate_noise(&current, &inliers);
+        let settled = (noise / current.noise - 1.0).abs() < NOISE.settled;
+        let mut fits = Fits::new(block, noise, stop);
+        let fitted = fits.refit(&current, &inliers, CONSENSUS.loss(noise), OPTIONS.first_iterations);
+        let refitted = fits.polish(fitted);
+        // A noise level at which the consensus falls apart was estimated from a fit too flexible to trust.
+        if refitted.inlier_count() < LEAST_INLIERS {
+            break;
+        }
+        current = refitted;
+        if settled {
+            break;
+        }
+    }
+    current
+}
+
+/// The consensus once its noise and its inliers agree, with the logarithm of its false alarms.
+///
+/// * `consensus`: polished at its own noise, as [`grow`] returns it
+/// * `spread`: see [`Consensus::ln_false_alarms_by_residuals`]
+pub fn refine(block: &CompleteBlock, consensus: &Consensus, spread: f64, stop: &StopToken) -> (Consensus, f64) {
+    let settled = settle_noise(block, consensus.clone(), stop);
+    let ln_false_alarms = a_contrario::ln_false_alarms(block, &settled, spread, stop);
+    (settled, ln_false_alarms)
+}
+
+/// Noise of a consensus by the median of these tracks' residuals.
+pub fn estimate_noise(consensus: &Consensus, inliers: &[usize]) -> f64 {
+    let views = consensus.cameras.len();
+    let per_track = (constraint_count(views, inliers.len()) / inliers.len() as f64).max(0.5);
+    let mut squared: Vec<f64> = inliers.iter().map(|&track| consensus.squared[track]).collect();
+    NOISE.clamp((median(&mut squared) / chi_square_median(per_track)).sqrt())
 }
