@@ -345,7 +345,8 @@ fn a_translation_behind_a_lens_that_distorts_is_not_metric() {
     }
     // An equidistant fisheye of 1.5 times the focal length bends as the barrel lens does: WEAK, off by half at 6 sigma.
     // Wrong observations fit a principal point outside the image behind the mild one: METRIC, off by 13 % at 6.6 sigma.
-    for (seed, lens) in [(820_818, LensKind::Barrel), (910_082, LensKind::Mild)] {
+    // Two cameras' equal distortion is that of fisheyes of 22 and 31 degrees: WEAK, off by a factor of 2.1 at 19 sigma.
+    for (seed, lens) in [(820_818, LensKind::Barrel), (910_082, LensKind::Mild), (940_002, LensKind::Mild)] {
         let options = PhotographedOptions::drawn(seed);
         assert_eq!((options.motion, options.lens), (PhotographedMotion::Translation, lens));
         let (_, solution) = solved_photographed(&options);
