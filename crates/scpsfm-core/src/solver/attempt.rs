@@ -32,8 +32,8 @@ options! {
         /// other errors than noise bound what it gives.
         most_calibrated: usize = 600,
         calibrated_observations: usize = 20_000,
-        /// Standard deviation of the log focal length that an undone lens stands for where the camera did not turn. The
-        /// last step between sampled lenses is 1.5 %.
+        /// Standard deviation of the log focal length that an undone lens stands for where the motion determines none.
+        /// The last step between sampled lenses is 1.5 %.
         undone_sigma: f64 = 0.02,
         /// Tracks that PAPER and SCPSFM optimise weights for, in up to 16 optimisations a block. The most that the
         /// recipe was measured with (20 views).
@@ -288,8 +288,8 @@ pub fn search_block(
     Ok(attempt)
 }
 
-/// Calibrates what stands of an attempt. Behind an undone lens a camera that did not turn gets the focal length of the
-/// lens: an extension, which adjusts it in the images, asks whether it holds.
+/// Calibrates what stands of an attempt. Behind an undone lens a focal length that the motion does not determine is that
+/// of the lens: an extension, which adjusts it in the images, asks whether it holds.
 pub fn calibrate(problem: &Problem, attempt: &mut Attempt, recorder: &mut Recorder) -> Result<(), Error> {
     let Some(projective) = &attempt.projective else { return Ok(()) };
     recorder.enter(Stage::Calibrate);
@@ -299,8 +299,9 @@ pub fn calibrate(problem: &Problem, attempt: &mut Attempt, recorder: &mut Record
         }
         _ => {
             let found = calibrate_projective(problem, projective, &problem.focal_priors)?;
-            let did_not_turn = found.warnings.iter().any(|warning| warning.code == WarningCode::PureTranslation);
-            match problem.undone.as_ref().filter(|_| did_not_turn && !problem.has_own_focals()) {
+            let is_open = found.grade == Grade::ProjectiveOnly
+                && found.warnings.iter().any(|warning| warning.code == WarningCode::UnobservableFocal);
+            match problem.undone.as_ref().filter(|_| is_open && !problem.has_own_focals()) {
                 Some(undone) => {
                     let of_lenses = undone.focal_priors(problem.scale_px, OPTIONS.undone_sigma);
                     let known = problem.focal_priors.iter().zip(of_lenses).map(|(known, of_lens)| known.or(of_lens));
