@@ -234,7 +234,9 @@ pub fn fit_translation(
     for view in (0..views).filter(|&view| view != reference) {
         let pairs = seen.common(reference, view);
         epipoles[view] = epipole(&pairs)?;
-        residuals.push(epipolar_residual(&pairs, &epipoles[view]));
+        let fundamental = Fundamental::of_translation(epipoles[view]);
+        let mut distances: Vec<f64> = pairs.iter().map(|seen| fundamental.sampson_squared(seen).sqrt()).collect();
+        residuals.push(median(&mut distances));
     }
     if median(&mut residuals) > limit * noise {
         return None;
@@ -257,13 +259,6 @@ fn epipole(pairs: &[Match]) -> Option<Vector3<f64>> {
         normal += line * line.transpose();
     }
     if pairs.len() < LEAST_COMMON { None } else { smallest_eigenvector(&normal) }
-}
-
-/// Median Sampson distance from the epipolar constraint `to . (e x from) = 0`.
-fn epipolar_residual(pairs: &[Match], epipole: &Vector3<f64>) -> f64 {
-    let fundamental = Fundamental::of_translation(*epipole);
-    let mut residuals: Vec<f64> = pairs.iter().map(|seen| fundamental.sampson_squared(seen).sqrt()).collect();
-    median(&mut residuals)
 }
 
 /// Lengths of the translations and inverse depths that go with the epipoles, by alternating least squares on

@@ -33,22 +33,20 @@ pub fn median_residual(observations: &[Observation], views: usize, noise: f64, l
     let mut references = vec![0, seen.most_observed()?, views - 1];
     references.sort_unstable();
     references.dedup();
+    // Median over the other views.
+    let residual_to = |reference: usize| {
+        let others = (0..views).filter(|&view| view != reference);
+        let found = others.filter_map(|view| pair_residual(&seen.common(reference, view), noise));
+        let mut residuals: Vec<f64> = found.collect();
+        (!residuals.is_empty()).then(|| median(&mut residuals))
+    };
     references
         .into_iter()
-        .filter_map(|reference| median_to(&seen, reference, noise))
+        .filter_map(residual_to)
         .try_fold(None, |largest: Option<f64>, residual| {
             (residual < limit).then(|| Some(largest.map_or(residual, |largest| largest.max(residual))))
         })
         .flatten()
-}
-
-/// Median over the other views of how far homographies to this reference miss.
-fn median_to(seen: &Correspondences, reference: usize, noise: f64) -> Option<f64> {
-    let mut residuals: Vec<f64> = (0..seen.by_view.len())
-        .filter(|&view| view != reference)
-        .filter_map(|view| pair_residual(&seen.common(reference, view), noise))
-        .collect();
-    (!residuals.is_empty()).then(|| median(&mut residuals))
 }
 
 /// Views without parallax, each placed by the points that it sees.
@@ -110,9 +108,7 @@ impl Correspondences {
     ///
     /// Returns `None` where the points do not tie all views together.
     pub fn homographies_from(&self, reference: usize, noise: f64) -> Option<Placed> {
-        self.placed((reference, Matrix3::identity()), |seen| {
-            robust(seen, noise.max(f64::EPSILON)).map(|(homography, _)| homography)
-        })
+        self.placed((reference, Matrix3::identity()), |seen| Some(robust(seen, noise.max(f64::EPSILON))?.0))
     }
 
     /// Sorts the observations; views out of range and what is no number are left out.

@@ -74,7 +74,6 @@ impl CompleteBlock {
         &self.observations[track * self.views..(track + 1) * self.views]
     }
 
-    /// The image point of `track` in `view`.
     pub fn point(&self, view: usize, track: usize) -> Vector2<f64> {
         self.observations[track * self.views + view].xy
     }

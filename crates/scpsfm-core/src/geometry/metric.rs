@@ -17,15 +17,6 @@ const PLANE_ITERATIONS: usize = 40;
 /// point at infinity would have no coordinates.
 const FARTHEST: f64 = 1e3;
 
-/// Homography `H` with `P H` metric and `H^-1 X` Euclidean: `[K 0; -n' K 1]`.
-fn upgrading_homography(daq: &Daq) -> Matrix4<f64> {
-    let calibration = daq.intrinsics.matrix();
-    let mut homography = Matrix4::identity();
-    homography.fixed_view_mut::<3, 3>(0, 0).copy_from(&calibration);
-    homography.fixed_view_mut::<1, 3>(3, 0).copy_from(&-(daq.plane_at_infinity.transpose() * calibration));
-    homography
-}
-
 /// Upgrades a projective reconstruction: the nearest rotations, and of the two mirror images the one with more
 /// observations in front of their cameras. The median depth becomes 1.
 ///
@@ -39,7 +30,11 @@ pub fn upgrade(
     own_focals: bool,
     observations: &[Observation],
 ) -> Option<MetricReconstruction> {
-    let homography = upgrading_homography(daq);
+    // `P H` is metric and `H^-1 X` Euclidean with `H = [K 0; -n' K 1]`.
+    let calibration = daq.intrinsics.matrix();
+    let mut homography = Matrix4::identity();
+    homography.fixed_view_mut::<3, 3>(0, 0).copy_from(&calibration);
+    homography.fixed_view_mut::<1, 3>(3, 0).copy_from(&-(daq.plane_at_infinity.transpose() * calibration));
     let back = homography.try_inverse()?;
     let focals = match own_focals {
         true => frame.cameras.iter().map(|camera| Some(daq::view_focal(camera, daq)?.0)).collect::<Option<Vec<_>>>()?,
@@ -47,12 +42,9 @@ pub fn upgrade(
     };
     let points = frame.points.iter().map(|point| euclidean(&(back * point))).collect();
     let mut reconstruction = MetricReconstruction {
-        intrinsics: vec![daq.intrinsics],
         group_of: vec![0; frame.cameras.len()],
         focals,
-        poses: Vec::new(),
-        points,
-        has_common_centre: false,
+        ..MetricReconstruction::new(daq.intrinsics, Vec::new(), points)
     };
     for (view, camera) in frame.cameras.iter().enumerate() {
         let uncalibrate = reconstruction.intrinsics_of(view).matrix().try_inverse()?;
@@ -112,7 +104,8 @@ fn euclidean(point: &Vector4<f64>) -> Vector3<f64> {
     if position.iter().all(|value| value.is_finite()) { position } else { point.xyz() * f64::MAX.sqrt() }
 }
 
-/// Of the two mirror images the one with more observations in front of their cameras, at a median depth of 1.
+/// Of the two mirror images the one with more observations in front of their cameras, at a median depth of 1, with far
+/// points held at [`FARTHEST`]; `None` where that depth is not a number.
 pub(super) fn oriented(
     mut reconstruction: MetricReconstruction,
     observations: &[Observation],
@@ -121,22 +114,7 @@ pub(super) fn oriented(
         reconstruction.poses.iter_mut().for_each(|pose| pose.translation.neg_mut());
         reconstruction.points.iter_mut().for_each(|point| point.neg_mut());
     }
-    scale_to_median_depth(&mut reconstruction, observations)?;
-    Some(reconstruction)
-}
-
-/// The rotation nearest to a 3x3 matrix up to scale, and the translation at that scale.
-fn pose(left: &Matrix3<f64>, right: &Vector3<f64>) -> Option<Pose> {
-    let sign = if left.determinant() < 0.0 { -1.0 } else { 1.0 };
-    let rotation = nearest_rotation(&(left * sign))?;
-    // The matrix is this rotation stretched by its singular values, whose mean is the scale.
-    let translation = right * (3.0 / rotation.dot(left));
-    translation.iter().all(|value| value.is_finite()).then_some(Pose { rotation, translation })
-}
-
-/// Scales the scene to a median depth of 1 and holds far points at [`FARTHEST`].
-fn scale_to_median_depth(reconstruction: &mut MetricReconstruction, observations: &[Observation]) -> Option<()> {
-    let mut depths: Vec<f64> = depths(reconstruction, observations).map(f64::abs).collect();
+    let mut depths: Vec<f64> = depths(&reconstruction, observations).map(f64::abs).collect();
     let median = median(&mut depths);
     if !(median > f64::MIN_POSITIVE && median.is_finite()) {
         return None;
@@ -149,7 +127,16 @@ fn scale_to_median_depth(reconstruction: &mut MetricReconstruction, observations
             *point = if norm.is_finite() { *point * (FARTHEST / norm) } else { Vector3::new(0.0, 0.0, FARTHEST) };
         }
     }
-    Some(())
+    Some(reconstruction)
+}
+
+/// The rotation nearest to a 3x3 matrix up to scale, and the translation at that scale.
+fn pose(left: &Matrix3<f64>, right: &Vector3<f64>) -> Option<Pose> {
+    let sign = if left.determinant() < 0.0 { -1.0 } else { 1.0 };
+    let rotation = nearest_rotation(&(left * sign))?;
+    // The matrix is this rotation stretched by its singular values, whose mean is the scale.
+    let translation = right * (3.0 / rotation.dot(left));
+    translation.iter().all(|value| value.is_finite()).then_some(Pose { rotation, translation })
 }
 
 fn depths<'a>(

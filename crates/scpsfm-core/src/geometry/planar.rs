@@ -106,7 +106,6 @@ impl Plane {
     }
 }
 
-/// The equations of all views.
 struct Equations {
     views: Vec<ViewHomography>,
     /// Of the reference view.
@@ -114,13 +113,6 @@ struct Equations {
     matrix: DMatrix<f64>,
     /// Half the gradient of the cost.
     gradient: DVector<f64>,
-}
-
-impl Equations {
-    fn new(views: Vec<ViewHomography>, reference_group: usize, groups: usize) -> Self {
-        let unknowns = groups + TURNS;
-        Self { views, reference_group, matrix: DMatrix::zeros(unknowns, unknowns), gradient: DVector::zeros(unknowns) }
-    }
 }
 
 impl LeastSquares for Equations {
@@ -175,8 +167,13 @@ pub fn upgrades(
     let (Some(back), Some(&last)) = (first.try_inverse(), group_of.iter().max()) else { return Vec::new() };
     let groups = 1 + last;
     let view = |(view, &group): (&Matrix3<f64>, &usize)| ViewHomography { homography: view * back, group };
-    let mut equations =
-        Equations::new(homographies.views.iter().zip(group_of).map(view).collect(), group_of[0], groups);
+    let unknowns = groups + TURNS;
+    let mut equations = Equations {
+        views: homographies.views.iter().zip(group_of).map(view).collect(),
+        reference_group: group_of[0],
+        matrix: DMatrix::zeros(unknowns, unknowns),
+        gradient: DVector::zeros(unknowns),
+    };
     let turns = |tilt: usize| if tilt == 0 { 1 } else { 6 * tilt };
     let normals: Vec<(f64, f64)> = (0..TILTS)
         .flat_map(|tilt| {

@@ -25,7 +25,6 @@ pub(crate) trait Estimator<const N: usize>: Sized {
     /// many do.
     const SAMPLE_GATES: f64 = 4.0;
 
-    /// Number of data.
     fn len(&self) -> usize;
 
     /// Distinct data, [`Self::SAMPLE`] of them. Where they are not drawn uniformly, the search ends after more or fewer
@@ -226,7 +225,6 @@ fn samples_wanted(inliers: usize, data: usize, sample: usize) -> usize {
     ((1.0 - CONFIDENCE).ln() / (-right).ln_1p()).ceil().max(1.0) as usize
 }
 
-/// The items of a sample.
 pub(crate) fn chosen<T: Copy, const N: usize>(items: &[T], sample: &[usize]) -> [T; N] {
     std::array::from_fn(|k| items[sample[k]])
 }

@@ -27,8 +27,7 @@ pub(super) fn is_worth_it<const C: usize, const P: usize>(problem: &impl BundleP
 
 /// The layout of the problem with cameras and points exchanged.
 pub(super) fn layout(layout: &Layout, cameras: usize) -> Layout {
-    let observations: Vec<Observation> = layout.observations.iter().copied().map(exchanged).collect();
-    Layout::new(&observations, layout.starts.len() - 1, cameras)
+    Layout::sorted(layout.observations.iter().copied().map(exchanged).collect(), cameras)
 }
 
 fn exchanged(seen: Observation) -> Observation {

@@ -3,14 +3,12 @@
 use nalgebra::{DMatrix, DVector};
 
 use super::Observation;
-use super::intrinsics::Intrinsics;
-use super::intrinsics::Parameter;
+use super::intrinsics::{Intrinsics, Parameter};
 use super::intrinsics_model::{IntrinsicsModel, IntrinsicsPrior};
 use super::metric::MetricReconstruction;
-use super::own_focals::Function;
 use super::sequence::System;
 use super::whitened::centre;
-use super::without_views::{PARAMETERS, WithoutViews, place, scale_of};
+use super::without_views::{Function, PARAMETERS, WithoutViews, place, scale_of};
 
 /// Information on the intrinsics, scaled by what they would have with everything else known, that counts as none.
 const NULL_INTRINSICS: f64 = 1e-10;

@@ -244,13 +244,6 @@ impl Intrinsics {
         (by_parameter, [by_seen(by_uv[0]), by_seen(by_uv[1])])
     }
 
-    /// Whether a point at this squared tangent of the angle from the optical axis lies before the fold, if there is
-    /// one.
-    #[cfg(test)]
-    pub fn images(&self, squared: f64) -> bool {
-        self.fold().is_none_or(|fold| self.argument(squared).0 < fold)
-    }
-
     /// Squared radius, of a fisheye squared angle, at which the image folds back: the least at which the derivative of
     /// `t` times the polynomial, the cubic `1 + 3 k1 t^2 + 5 k2 t^4 + 7 k3 t^6`, vanishes. Tangential terms, which are
     /// small before the radial ones, are left out.
@@ -388,6 +381,14 @@ impl Intrinsics {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    impl Intrinsics {
+        /// Whether a point at this squared tangent of the angle from the optical axis lies before the fold, if there is
+        /// one.
+        pub(crate) fn images(&self, squared: f64) -> bool {
+            self.fold().is_none_or(|fold| self.argument(squared).0 < fold)
+        }
+    }
 
     /// Where a pinhole would have seen it.
     fn undone(lens: &Intrinsics, xy: Vector2<f64>) -> Option<Vector2<f64>> {

@@ -59,7 +59,6 @@ impl Extension {
     }
 }
 
-/// How focal lengths are adjusted.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
 enum FocalLength {
     Held,
@@ -80,8 +79,6 @@ impl IntrinsicsModel {
     pub const FIXED: Self = Self { focal: FocalLength::Held, extensions: [false; Extension::ALL.len()] };
     pub const FOCAL: Self = Self { focal: FocalLength::Shared, ..Self::FIXED };
     pub const FOCAL_PER_VIEW: Self = Self { focal: FocalLength::PerView, ..Self::FIXED };
-    #[cfg(test)]
-    pub const FULL: Self = Self::FOCAL.with_all_extensions();
 
     /// The simplest model: a focal length for all views, or one of each view.
     pub fn focal(per_view: bool) -> Self {
@@ -115,7 +112,6 @@ impl IntrinsicsModel {
         self
     }
 
-    /// This model with one extension fewer.
     pub fn without(mut self, extension: Extension) -> Self {
         self.extensions[extension as usize] = false;
         self
@@ -142,7 +138,6 @@ impl IntrinsicsModel {
         self
     }
 
-    /// Extensions that are free.
     pub fn extensions(self) -> impl Iterator<Item = Extension> {
         Extension::ALL.into_iter().filter(move |extension| self.contains(*extension))
     }
@@ -186,7 +181,6 @@ pub struct IntrinsicsPrior {
 }
 
 impl IntrinsicsPrior {
-    /// Nothing is known.
     pub const NONE: Self = Self { mean: [0.0; Parameter::COUNT], information: [0.0; Parameter::COUNT] };
 
     /// Adds knowledge of a parameter of which nothing was known.

@@ -62,7 +62,6 @@ pub(crate) struct Projection<'a> {
     pub image: Vector2<f64>,
 }
 
-/// Gradients of the two coordinates of an image point.
 pub(crate) struct ProjectionGradients {
     /// By the intrinsics, in the order of [`Parameter`].
     pub by_parameter: [[f64; Parameter::COUNT]; 2],
@@ -159,7 +158,6 @@ impl MetricReconstruction {
         (of_view * self.poses.len() + of_point * points + self.focals.len() + shared).saturating_sub(gauge)
     }
 
-    /// Whether every view has a focal length of its own.
     pub fn has_own_focals(&self) -> bool {
         !self.focals.is_empty()
     }
@@ -199,7 +197,6 @@ impl MetricReconstruction {
         }
     }
 
-    /// Multiplies all focal lengths.
     pub fn scale_focals(&mut self, factor: f64) {
         self.intrinsics.iter_mut().for_each(|intrinsics| intrinsics.focal *= factor);
         self.focals.iter_mut().for_each(|focal| *focal *= factor);
@@ -245,10 +242,7 @@ impl MetricReconstruction {
         self.intrinsics_of(seen.view).project(&self.poses[seen.view].apply(&self.points[seen.point])) - seen.xy
     }
 
-    /// The squared residual by the observation's weight.
-    ///
-    /// # Panics
-    /// As [`Self::residual`].
+    /// The squared [`residual`](Self::residual) by the observation's weight.
     pub fn weighted_squared(&self, seen: &Observation) -> f64 {
         seen.weight * self.residual(seen).norm_squared()
     }

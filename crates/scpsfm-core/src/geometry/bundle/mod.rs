@@ -9,19 +9,16 @@
 //! Image coordinates are normalised throughout: pixels minus the guessed principal point, over the larger image side.
 
 mod camera_elimination;
-mod cholesky;
 mod covariance;
 pub mod critical;
+mod dense;
 mod engine;
 mod fisheye;
 mod intrinsics;
 mod intrinsics_model;
 pub mod metric;
-mod own_focals;
-mod panel;
 mod problem;
 pub mod projective;
-mod reduced;
 pub mod sequence;
 #[cfg(test)]
 pub(crate) mod testing;

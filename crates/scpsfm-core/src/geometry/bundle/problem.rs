@@ -15,6 +15,12 @@ pub(crate) struct Jacobian<const C: usize, const P: usize> {
     pub point: SMatrix<f64, P, 2>,
 }
 
+impl<const C: usize, const P: usize> Jacobian<C, P> {
+    pub fn zeros() -> Self {
+        Self { camera: SMatrix::zeros(), point: SMatrix::zeros() }
+    }
+}
+
 /// A change of the unknowns in the tangent space.
 #[derive(Debug, Clone)]
 pub(crate) struct Step<const C: usize, const P: usize> {
@@ -35,7 +41,6 @@ impl<const C: usize, const P: usize> Step<C, P> {
 
 /// A bundle adjustment: `C` unknowns a camera, `P` a point.
 pub(crate) trait BundleProblem<const C: usize, const P: usize>: Clone {
-    /// How many cameras and points there are.
     fn counts(&self) -> (usize, usize);
     /// The residual of one observation, predicted minus observed, and what calculates its Jacobian.
     fn evaluate(&self, seen: Observation) -> (Vector2<f64>, impl FnOnce() -> Jacobian<C, P>);

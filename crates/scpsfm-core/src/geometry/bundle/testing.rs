@@ -5,7 +5,7 @@ use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 
 use super::Observation;
-use super::metric::{Intrinsics, MetricReconstruction, Pose};
+use super::metric::{Intrinsics, IntrinsicsModel, MetricReconstruction, Pose};
 use super::problem::{BundleProblem, Step};
 use crate::synthetic::{Scene, SceneOptions};
 
@@ -14,6 +14,10 @@ pub(crate) const NOISE: f64 = 0.003;
 const IMAGE_SIDE_PX: f64 = 1000.0;
 /// Points nearer than this redraw a camera, as in the generator.
 const MIN_DEPTH: f64 = 0.5;
+
+impl IntrinsicsModel {
+    pub(crate) const FULL: Self = Self::FOCAL.with_all_extensions();
+}
 
 /// A scene with its truth; image coordinates are normalised.
 #[derive(Clone)]

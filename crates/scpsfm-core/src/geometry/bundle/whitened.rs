@@ -50,7 +50,7 @@ impl<const C: usize> Basis<C> {
             false => 1.0,
         });
         let scaled = DMatrix::from_fn(C, C, |row, column| block[(row, column)] / (unit[row] * unit[column]));
-        let Eigen { values, vectors } = Eigen::of(&scaled)?;
+        let (values, vectors) = eigen(&scaled)?;
         let mut basis = Self { directions: SMatrix::zeros(), coordinates: SMatrix::zeros(), unseen: [0.0; C] };
         for (k, value) in values.iter().enumerate() {
             let is_seen = *value > ROUNDING * values[C - 1];
@@ -68,29 +68,23 @@ impl<const C: usize> Basis<C> {
     }
 }
 
-/// Eigenvalues in ascending order, and their vectors.
-struct Eigen {
-    values: Vec<f64>,
-    vectors: DMatrix<f64>,
-}
-
-impl Eigen {
-    /// Of a symmetric matrix that is not empty; `None` where it holds what is no number.
-    fn of(matrix: &DMatrix<f64>) -> Option<Self> {
-        if matrix.iter().any(|value| !value.is_finite()) {
-            return None;
-        }
-        let n = matrix.nrows();
-        let eigen = MatRef::from_column_major_slice(matrix.as_slice(), n, n).self_adjoint_eigen(Side::Lower).ok()?;
-        let values = (0..n).map(|k| eigen.S()[k]).collect();
-        Some(Self { values, vectors: DMatrix::from_fn(n, n, |row, k| eigen.U()[(row, k)]) })
+/// Eigenvalues of a symmetric matrix that is not empty, in ascending order, and their vectors; `None` where it holds
+/// what is no number.
+fn eigen(matrix: &DMatrix<f64>) -> Option<(Vec<f64>, DMatrix<f64>)> {
+    if matrix.iter().any(|value| !value.is_finite()) {
+        return None;
     }
+    let n = matrix.nrows();
+    let eigen = MatRef::from_column_major_slice(matrix.as_slice(), n, n).self_adjoint_eigen(Side::Lower).ok()?;
+    let values = (0..n).map(|k| eigen.S()[k]).collect();
+    Some((values, DMatrix::from_fn(n, n, |row, k| eigen.U()[(row, k)])))
 }
 
 /// The information on the views, by its eigenvalues in the new coordinates.
 pub(super) struct WhitenedViews<const C: usize> {
     bases: Vec<Basis<C>>,
-    eigen: Eigen,
+    values: Vec<f64>,
+    vectors: DMatrix<f64>,
 }
 
 impl<const C: usize> WhitenedViews<C> {
@@ -115,7 +109,8 @@ impl<const C: usize> WhitenedViews<C> {
         for direction in similarity(poses, &bases) {
             whitened.ger(1.0, &direction, &direction, 1.0);
         }
-        Some(Self { bases, eigen: Eigen::of(&whitened)? })
+        let (values, vectors) = eigen(&whitened)?;
+        Some(Self { bases, values, vectors })
     }
 
     /// A linear function of the views' unknowns in the new coordinates.
@@ -136,9 +131,9 @@ impl<const C: usize> WhitenedViews<C> {
 
     /// Directions with the information on each; `None` where rounding hides it, and that is little.
     pub fn directions(&self) -> impl Iterator<Item = (Option<f64>, nalgebra::DVectorView<'_, f64>)> {
-        let largest = self.eigen.values.last().copied().unwrap_or(0.0);
+        let largest = self.values.last().copied().unwrap_or(0.0);
         let known = move |value: &f64| Some(*value).filter(|value| *value > ROUNDING * largest);
-        self.eigen.values.iter().map(known).zip(self.eigen.vectors.column_iter())
+        self.values.iter().map(known).zip(self.vectors.column_iter())
     }
 }
 

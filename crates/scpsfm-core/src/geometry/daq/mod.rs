@@ -5,13 +5,11 @@
 
 mod frame;
 mod starts;
-mod view_focals;
 
 use nalgebra::{Matrix3, Matrix3x4, SMatrix, SVector, Vector3};
 
 pub use self::frame::{CanonicalFrame, oriented, to_canonical_frame};
-pub use self::starts::{scan, scan_focal, scan_planes};
-pub use self::view_focals::{view_focal, view_focal_starts};
+pub use self::starts::{scan, scan_focal, scan_planes, view_focal, view_focal_starts};
 use super::bundle::metric::Intrinsics;
 use super::levenberg_marquardt::{self, LeastSquares, Normal, Options};
 use crate::domain::StopToken;

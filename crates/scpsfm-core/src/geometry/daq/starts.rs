@@ -1,12 +1,18 @@
-//! Where to start: a scan of focal lengths with the plane at infinity in closed form.
+//! Where to start: a scan of focal lengths with the plane at infinity in closed form, one focal length for all views or
+//! one of each.
 
 use nalgebra::{Matrix3, Matrix3x4, Vector3};
 
-use super::{Daq, residual};
+use super::{Daq, infinite_homography, residual};
 
 /// Focal lengths of a scan, in image sides: from wider than any rectilinear lens (118 degrees) to a telephoto of 11
 /// degrees.
 const SCAN_RANGE: (f64, f64) = (0.3, 5.0);
+/// Focal lengths of the first view that are tried, views that the plane at infinity is taken from, and the ratios of
+/// the focal lengths of the two.
+const FOCALS: usize = 20;
+const VIEWS: usize = 4;
+const RATIOS: [f64; 5] = [0.5, 0.71, 1.0, 1.41, 2.0];
 
 /// Plane at infinity from a second view when the focal lengths of both are known (Gherardi & Fusiello 2010, section 3).
 ///
@@ -43,23 +49,48 @@ pub fn scan_focal(step: usize, focals: usize) -> f64 {
 /// the first give in closed form. Returns them with their residual, best first.
 pub fn scan(cameras: &[Matrix3x4<f64>], focals: usize, views: usize) -> Vec<(Daq, f64)> {
     let focals = (0..focals).map(|step| scan_focal(step, focals));
-    ranked(scanned(cameras, focals, views, &[1.0]), |daq| residual(cameras, daq))
+    ranked(cameras, focals, views, &[1.0], |daq| residual(cameras, daq))
 }
 
 /// The same of one focal length, which is known.
 pub fn scan_planes(cameras: &[Matrix3x4<f64>], focal: f64, views: usize) -> Vec<(Daq, f64)> {
-    ranked(scanned(cameras, [focal], views, &[1.0]), |daq| residual(cameras, daq))
+    ranked(cameras, [focal], views, &[1.0], |daq| residual(cameras, daq))
 }
 
-/// The quadrics of a scan.
+/// Focal length that the quadric gives a view, and how far the view is from zero skew, square pixels and a principal
+/// point in the origin: a squared distance without unit.
+///
+/// Returns `None` where the quadric gives no focal length.
+pub fn view_focal(camera: &Matrix3x4<f64>, daq: &Daq) -> Option<(f64, f64)> {
+    let homography = infinite_homography(camera, daq);
+    let seen = homography * daq.diac() * homography.transpose();
+    let squared = 0.5 * (seen.m11 + seen.m22) / seen.m33;
+    let unit = 0.5 * (seen.m11 + seen.m22);
+    let skew = (seen.m12 / unit).powi(2) + (0.5 * (seen.m11 - seen.m22) / unit).powi(2);
+    let centre = (seen.m13 * seen.m13 + seen.m23 * seen.m23) / (unit * seen.m33).abs();
+    let usable = squared > 0.0 && squared.is_finite() && skew.is_finite() && centre.is_finite();
+    usable.then(|| (squared.sqrt(), skew + centre))
+}
+
+/// Quadrics to start from, best first: the planes at infinity that pairs of focal lengths give in closed form.
+/// `daq.intrinsics` is the first view's.
+pub fn view_focal_starts(cameras: &[Matrix3x4<f64>]) -> Vec<(Daq, f64)> {
+    let focals = (0..FOCALS).map(|step| scan_focal(step, FOCALS));
+    ranked(cameras, focals, VIEWS, &RATIOS, |daq| {
+        cameras.iter().map(|camera| view_focal(camera, daq).map_or(1.0, |(_, cost)| cost.min(1.0))).sum()
+    })
+}
+
+/// The quadrics of a scan with what each costs, best first; without those whose cost is no number.
 ///
 /// * `ratios`: of the focal length of the other view to that of the first
-pub(super) fn scanned(
+fn ranked(
     cameras: &[Matrix3x4<f64>],
     focals: impl IntoIterator<Item = f64>,
     views: usize,
     ratios: &[f64],
-) -> Vec<Daq> {
+    cost: impl Fn(&Daq) -> f64,
+) -> Vec<(Daq, f64)> {
     let mut widest: Vec<&Matrix3x4<f64>> = cameras.iter().skip(1).collect();
     widest.sort_by(|a, b| b.column(3).norm().total_cmp(&a.column(3).norm()));
     let mut found = Vec::new();
@@ -67,22 +98,17 @@ pub(super) fn scanned(
         for camera in widest.iter().take(views) {
             let planes = ratios.iter().filter_map(|ratio| plane_from_focals(camera, focal, ratio * focal)).flatten();
             let finite = planes.filter(|plane| plane.iter().all(|value| value.is_finite()));
-            found.extend(finite.map(|plane| Daq::new(focal, plane)));
+            let costs = finite.map(|plane| Daq::new(focal, plane)).map(|daq| (daq, cost(&daq)));
+            found.extend(costs.filter(|(_, cost)| cost.is_finite()));
         }
     }
+    found.sort_by(|a, b| a.1.total_cmp(&b.1));
     found
-}
-
-/// Quadrics with what each costs, best first; without those whose cost is no number.
-pub(super) fn ranked(found: Vec<Daq>, cost: impl Fn(&Daq) -> f64) -> Vec<(Daq, f64)> {
-    let costs = found.into_iter().map(|daq| (daq, cost(&daq)));
-    let mut ranked: Vec<(Daq, f64)> = costs.filter(|(_, cost)| cost.is_finite()).collect();
-    ranked.sort_by(|a, b| a.1.total_cmp(&b.1));
-    ranked
 }
 
 #[cfg(test)]
 mod tests {
+    use super::super::super::bundle::metric::Intrinsics;
     use super::super::super::bundle::testing;
     use super::super::to_canonical_frame;
     use super::*;
@@ -104,5 +130,25 @@ mod tests {
     fn views_without_a_baseline_give_no_plane() {
         assert_eq!(plane_from_focals(&Matrix3x4::identity(), 1.0, 1.0), None);
         assert!(scan(&[Matrix3x4::identity(); 3], 4, 2).is_empty());
+    }
+
+    #[test]
+    fn a_start_is_near_every_focal_length() {
+        let mut near = 0;
+        for seed in 0..10 {
+            let scene = testing::scene(seed, 8, 20, 0.0);
+            let focals: Vec<f64> = (0..8).map(|view| 1.0 + 0.1 * view as f64).collect();
+            let camera = |(view, focal): (usize, &f64)| scene.poses[view].camera(&Intrinsics::from_focal(*focal));
+            let cameras: Vec<_> = focals.iter().enumerate().map(camera).collect();
+            let frame = to_canonical_frame(&cameras, &[]).expect("rank 3");
+            let (best, cost) = view_focal_starts(&frame.cameras)[0];
+            let worst = frame.cameras.iter().zip(&focals).map(|(camera, focal)| {
+                view_focal(camera, &best).map_or(f64::INFINITY, |(found, _)| (found / focal).ln().abs())
+            });
+            let worst = worst.fold(0.0, f64::max);
+            println!("seed {seed}: cost {cost:.2e}, worst focal length off by {worst:.3}");
+            near += usize::from(worst < 0.3);
+        }
+        assert!(near >= 8, "{near} of 10");
     }
 }

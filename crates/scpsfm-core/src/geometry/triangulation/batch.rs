@@ -242,7 +242,7 @@ impl<const N: usize> SideBySide<N> {
             normal.add_square(normal.trace(), points);
             normal.hold_unseen();
             for diagonal in DIAGONAL {
-                normal.0[diagonal] *= F64xN::ONE + damping;
+                normal.0[diagonal] = normal.0[diagonal] * (F64xN::ONE + damping);
             }
             let step = normal.factor().solve(gradient);
             let candidates =

@@ -4,7 +4,7 @@
 //! Everything is inlined into its caller, which [`vectorised`](crate::simd::vectorised) compiles.
 
 use std::array::from_fn;
-use std::ops::{Add, AddAssign, Div, Mul, MulAssign, Sub};
+use std::ops::{Add, AddAssign, Div, Mul, Sub};
 
 /// What is added to the diagonal for a null vector, as a share of the trace: it moves no eigenvector, and makes the
 /// factorisation of what rounding left singular or indefinite (1e-16 of the trace) safe.
@@ -94,13 +94,6 @@ impl<const N: usize> AddAssign for F64xN<N> {
     }
 }
 
-impl<const N: usize> MulAssign for F64xN<N> {
-    #[inline(always)]
-    fn mul_assign(&mut self, other: Self) {
-        *self = *self * other;
-    }
-}
-
 /// A homogeneous point of every track.
 pub type Points<const N: usize> = [F64xN<N>; 4];
 
@@ -160,7 +153,8 @@ impl<const N: usize> Symmetric<N> {
         let mut power = self.factor().inverse();
         for _ in 0..SQUARINGS {
             // Of trace 1: its squares stay in range.
-            power = power.scaled(power.trace().recip()).squared();
+            let scale = power.trace().recip();
+            power = Self(power.0.map(|entry| entry * scale)).squared();
         }
         // One column at least is not orthogonal to what is sought: the longest.
         let [first, others @ ..] = power.columns();
@@ -192,14 +186,8 @@ impl<const N: usize> Symmetric<N> {
 
     #[inline(always)]
     fn times(&self, v: Points<N>) -> Points<N> {
-        let m = &self.0;
-        let [a, b, c, d] = v;
-        [
-            m[0] * a + m[1] * b + m[3] * c + m[6] * d,
-            m[1] * a + m[2] * b + m[4] * c + m[7] * d,
-            m[3] * a + m[4] * b + m[5] * c + m[8] * d,
-            m[6] * a + m[7] * b + m[8] * c + m[9] * d,
-        ]
+        let [a, b, c, d] = self.columns();
+        [dot(a, v), dot(b, v), dot(c, v), dot(d, v)]
     }
 
     #[inline(always)]
@@ -224,11 +212,6 @@ impl<const N: usize> Symmetric<N> {
             dot(d, c),
             dot(d, d),
         ])
-    }
-
-    #[inline(always)]
-    fn scaled(&self, factor: F64xN<N>) -> Self {
-        Self(self.0.map(|entry| entry * factor))
     }
 
     /// Cholesky's factor (Golub & Van Loan, section 4.2); not a number where the matrix is not positive definite.

@@ -11,7 +11,7 @@ use super::{Free, MetricReconstruction, Observation};
 
 /// The unknowns of views and groups, in blocks: the free views that see something, then the groups with free
 /// intrinsics.
-#[derive(Debug)]
+#[derive(Debug, Clone)]
 pub(super) struct Unknowns {
     /// Block of a view: its pose, and its own focal length where that is free; `None` where it is held or sees nothing.
     pub view_block: Vec<Option<usize>>,
@@ -50,15 +50,8 @@ impl Unknowns {
         Self { view_block, group_block, parameters, offsets }
     }
 
-    /// Block of the intrinsics of a view.
     pub fn group_block_of_view(&self, sequence: &MetricReconstruction, view: usize) -> Option<usize> {
         *self.group_block.get(*sequence.group_of.get(view)?)?
-    }
-
-    /// Unknowns of a view that is free; 0 of one that is held.
-    #[inline]
-    pub fn of_view(&self, view: usize) -> usize {
-        self.view_block[view].map_or(0, |block| self.range(block).len())
     }
 
     pub fn block_count(&self) -> usize {
@@ -70,13 +63,17 @@ impl Unknowns {
         self.offsets[self.block_count()]
     }
 
-    /// The unknowns of a block.
+    /// Unknowns of a block.
+    #[inline]
+    pub fn size(&self, block: usize) -> usize {
+        self.offsets[block + 1] - self.offsets[block]
+    }
+
     pub fn range(&self, block: usize) -> Range<usize> {
         self.offsets[block]..self.offsets[block + 1]
     }
 }
 
-/// One observation of a point.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Seen {
     pub view: usize,
@@ -99,11 +96,10 @@ pub(super) struct IncidentBlock {
 #[derive(Debug)]
 pub(super) struct Layout {
     pub unknowns: Unknowns,
-    seen: Vec<Seen>,
+    pub all_seen: Vec<Seen>,
     seen_starts: Vec<usize>,
     incident_blocks: Vec<IncidentBlock>,
     incident_block_starts: Vec<usize>,
-    /// Start of a point's couplings.
     coupling_starts: Vec<usize>,
 }
 
@@ -124,7 +120,7 @@ impl Layout {
             |Observation { view, xy, weight, .. }| Seen { view, xy, weight, view_coupling: None, group_coupling: None };
         let mut layout = Self {
             unknowns: Unknowns::new(sequence, free, &sees),
-            seen: sorted.observations.into_iter().map(unlinked).collect(),
+            all_seen: sorted.observations.into_iter().map(unlinked).collect(),
             seen_starts: sorted.starts,
             incident_blocks: Vec::new(),
             incident_block_starts: vec![0],
@@ -140,7 +136,7 @@ impl Layout {
         let mut blocks: Vec<usize> = Vec::new();
         let mut couplings = 0;
         for point in 0..self.point_count() {
-            let seen = &mut self.seen[self.seen_starts[point]..self.seen_starts[point + 1]];
+            let seen = &mut self.all_seen[self.seen_starts[point]..self.seen_starts[point + 1]];
             let first = self.incident_blocks.len();
             let view = |seen: &Seen| unknowns.view_block[seen.view];
             let group = |seen: &Seen| unknowns.group_block_of_view(sequence, seen.view);
@@ -152,7 +148,7 @@ impl Layout {
             let mut size = 0;
             for &block in &blocks {
                 self.incident_blocks.push(IncidentBlock { block: block as u32, coupling: size as u32 });
-                size += POINT * unknowns.range(block).len();
+                size += POINT * unknowns.size(block);
             }
             let incident_blocks = &self.incident_blocks[first..];
             let place = |block: Option<usize>| {
@@ -173,13 +169,8 @@ impl Layout {
         self.seen_starts.len() - 1
     }
 
-    pub fn is_empty(&self) -> bool {
-        self.seen.is_empty()
-    }
-
-    /// Observations of a point.
     pub fn seen(&self, point: usize) -> &[Seen] {
-        &self.seen[self.seen_starts[point]..self.seen_starts[point + 1]]
+        &self.all_seen[self.seen_range(point..point + 1)]
     }
 
     /// Blocks that a point is linked with, ascending.
@@ -187,7 +178,6 @@ impl Layout {
         &self.incident_blocks[self.incident_block_starts[point]..self.incident_block_starts[point + 1]]
     }
 
-    /// Whether a point is linked with any block.
     pub fn is_coupled(&self, point: usize) -> bool {
         !self.incident_blocks(point).is_empty()
     }
@@ -197,33 +187,14 @@ impl Layout {
         self.coupling_starts[points.start]..self.coupling_starts[points.end]
     }
 
-    /// Values of all couplings.
-    pub fn coupling_count(&self) -> usize {
-        self.coupling_starts[self.point_count()]
-    }
-
     /// Share of all pairs of an unknown and a point with any that are coupled; not a number where there are none.
     pub fn coupled_share(&self) -> f64 {
         let points = (0..self.point_count()).filter(|point| self.is_coupled(*point)).count();
-        self.coupling_count() as f64 / (POINT * self.unknowns.count() * points) as f64
+        self.coupling_starts[self.point_count()] as f64 / (POINT * self.unknowns.count() * points) as f64
     }
 
     /// Where the observations of a run of points are among all.
     pub fn seen_range(&self, points: Range<usize>) -> Range<usize> {
         self.seen_starts[points.start]..self.seen_starts[points.end]
-    }
-
-    /// All observations, sorted by point.
-    pub fn all_seen(&self) -> &[Seen] {
-        &self.seen
-    }
-
-    /// Points that are coupled with each block, ascending.
-    pub fn points_by_block(&self) -> Vec<Vec<u32>> {
-        let mut points = vec![Vec::new(); self.unknowns.block_count()];
-        for point in 0..self.point_count() {
-            self.incident_blocks(point).iter().for_each(|incident| points[incident.block as usize].push(point as u32));
-        }
-        points
     }
 }

@@ -2,11 +2,10 @@
 
 use super::super::metric::{IntrinsicsModel, IntrinsicsPrior, POSE};
 use super::super::{Loss, Options, Report};
-use super::cost::cost;
-use super::embedded_points::iterate_points;
 use super::layout::Layout;
 use super::normal::Normal;
 use super::pattern::Pattern;
+use super::point::{cost_of_point, iterate_points};
 use super::reduced::{Reduced, substitute};
 use super::solver::SparseCholesky;
 use super::worker_pool::WorkerPool;
@@ -50,7 +49,7 @@ pub fn adjust(
         let sparse = if pattern.is_square { None } else { Some(SparseCholesky::new(&pattern)?) };
         Some((sparse, pattern))
     };
-    let Some((sparse, pattern)) = (!layout.is_empty()).then(solvable).flatten() else {
+    let Some((sparse, pattern)) = (!layout.all_seen.is_empty()).then(solvable).flatten() else {
         return Report::at(cost(sequence, priors, loss, &pool).unwrap_or(f64::INFINITY));
     };
     let normal = Normal::new(&layout, &pattern, sequence);
@@ -63,11 +62,6 @@ pub fn adjust(
 
 /// As [`adjust`], over all poses and points and one model for every camera group, on the caller's thread. Focal
 /// lengths a view are free only where the reconstruction has them.
-///
-/// The cost contains what the priors add.
-///
-/// # Pitfall
-/// Points may pass behind a camera on the way: residuals know no cheirality, so check it on the result.
 pub fn adjust_all(
     reconstruction: &mut MetricReconstruction,
     observations: &[Observation],
@@ -79,6 +73,15 @@ pub fn adjust_all(
     let models = vec![model; reconstruction.intrinsics.len()];
     let run = Run { threads: Threads::ONE, stop, heartbeat: &mut || () };
     adjust(reconstruction, observations, &Free::all(&models), priors, options, run)
+}
+
+/// Sum of the loss over the observations and of what the priors add; `None` when it was stopped.
+fn cost(sequence: &MetricReconstruction, priors: &[IntrinsicsPrior], loss: Loss, pool: &WorkerPool) -> Option<f64> {
+    let layout = pool.layout;
+    let groups = priors.iter().zip(&layout.unknowns.parameters).zip(&sequence.intrinsics);
+    let of_priors: f64 = groups.map(|((prior, parameters), intrinsics)| prior.cost(parameters, intrinsics)).sum();
+    let of_point = |point: usize| Some(cost_of_point(sequence, layout.seen(point), &sequence.points[point], loss));
+    Some(pool.of_points(of_point)?.into_iter().fold(of_priors, |sum, cost| sum + cost))
 }
 
 /// What the steps need from one to the next.

@@ -6,8 +6,6 @@
 //! are eliminated many at a time. May depend on nothing of `geometry` but `bundle` and `levenberg_marquardt`, and on
 //! linear algebra.
 
-mod cost;
-mod embedded_points;
 mod layout;
 mod minimise;
 mod normal;

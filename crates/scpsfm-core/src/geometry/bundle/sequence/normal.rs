@@ -75,17 +75,10 @@ impl Weighted {
     }
 }
 
-/// Views and intrinsics among themselves.
+/// Where the residuals of all views go.
 #[derive(Debug)]
-pub(super) struct Cameras {
-    /// One a view.
-    places: Vec<ViewPlaces>,
-    /// Where the diagonal is among the values.
-    pub diagonal: Vec<usize>,
-    /// `Jc' Jc`, in the order of the pattern.
-    pub values: Vec<f64>,
-    /// Half the gradient of the cost.
-    pub gradient: Vec<f64>,
+struct Places {
+    of_view: Vec<ViewPlaces>,
     /// Values and unknowns that belong to the views before each, and to all of them: the groups' come after these.
     before: Vec<(usize, usize)>,
 }
@@ -93,7 +86,13 @@ pub(super) struct Cameras {
 /// The normal equations `J' J dx = -J' r`.
 #[derive(Debug)]
 pub(super) struct Normal {
-    pub cameras: Cameras,
+    places: Places,
+    /// Views and intrinsics among themselves, `Jc' Jc`, in the order of the pattern.
+    pub values: Vec<f64>,
+    /// Where the diagonal is among them.
+    pub diagonal: Vec<usize>,
+    /// Half the gradient of the cost by views and intrinsics.
+    pub gradient: Vec<f64>,
     /// Couplings of views and intrinsics with the points, `Jc' Jp`.
     pub couplings: Vec<f64>,
     pub points: Vec<PointBlock>,
@@ -101,29 +100,16 @@ pub(super) struct Normal {
     rows: Vec<Option<Weighted>>,
 }
 
-/// What the rows of a batch are added to.
-enum Sums<'a> {
-    /// Blocks of some views and theirs with the intrinsics.
-    Views { range: Range<usize>, values: &'a mut [f64], gradient: &'a mut [f64] },
-    /// Blocks of all groups' intrinsics.
-    Groups { values: &'a mut [f64], gradient: &'a mut [f64] },
-}
-
-/// What a batch adds, and where.
-struct Batch<'a> {
-    places: &'a [ViewPlaces],
-    before: &'a [(usize, usize)],
-    /// Its observations.
-    seen: &'a [Seen],
-    rows: &'a [Option<Weighted>],
-}
-
 impl Normal {
     pub fn new(layout: &Layout, pattern: &Pattern, sequence: &MetricReconstruction) -> Self {
+        let points = layout.point_count();
         Self {
-            cameras: Cameras::new(layout, pattern, sequence),
-            couplings: vec![0.0; layout.coupling_count()],
-            points: vec![PointBlock::ZERO; layout.point_count()],
+            places: Places::new(pattern, sequence),
+            values: vec![0.0; pattern.value_count()],
+            diagonal: pattern.diagonal(),
+            gradient: vec![0.0; pattern.unknowns.count()],
+            couplings: vec![0.0; layout.couplings_of(0..points).len()],
+            points: vec![PointBlock::ZERO; points],
             rows: Vec::new(),
         }
     }
@@ -139,22 +125,30 @@ impl Normal {
         loss: Loss,
         pool: &WorkerPool,
     ) -> bool {
-        self.cameras.values.fill(0.0);
-        self.cameras.gradient.fill(0.0);
-        self.cameras.add_priors(sequence, pool.layout, priors);
+        self.values.fill(0.0);
+        self.gradient.fill(0.0);
+        let unknowns = &pool.layout.unknowns;
+        for (group, prior) in priors.iter().enumerate().take(sequence.intrinsics.len()) {
+            let Some(block) = unknowns.group_block[group] else { continue };
+            for (index, parameter) in unknowns.range(block).zip(&unknowns.parameters[group]) {
+                let information = prior.information[*parameter as usize];
+                self.gradient[index] += information * prior.deviation(*parameter, &sequence.intrinsics[group]);
+                self.values[self.diagonal[index]] += information;
+            }
+        }
         for points in pool.batches() {
             if pool.stop.is_stopped() {
                 return false;
             }
             self.linearise(sequence, loss, pool, points.clone());
-            self.cameras.add_batch(pool, points, &self.rows);
+            self.add_batch(pool, points);
         }
         true
     }
 
     /// Rows of the Jacobian of a batch of points, and the points' own blocks and couplings.
     fn linearise(&mut self, sequence: &MetricReconstruction, loss: Loss, pool: &WorkerPool, points: Range<usize>) {
-        let layout = pool.layout;
+        let (layout, unknowns) = (pool.layout, &pool.layout.unknowns);
         let seen = layout.seen_range(points.clone()).len();
         // What is left from another batch is written over before it is read.
         self.rows.resize_with(self.rows.len().max(seen), || None);
@@ -179,11 +173,12 @@ impl Normal {
                         let couplings = split_off(&mut couplings, layout.couplings_of(point..point + 1).len());
                         couplings.fill(0.0);
                         for (seen, slot) in seen.iter().zip(split_off(&mut rows, seen.len())) {
-                            let parameters = &layout.unknowns.parameters[sequence.group_of[seen.view]];
+                            let parameters = &unknowns.parameters[sequence.group_of[seen.view]];
                             *slot = Weighted::new(sequence, &sequence.points[point], seen, parameters, loss);
                             if let Some(row) = slot {
                                 block.add(&row.point, row.residual);
-                                row.link_blocks(seen, layout.unknowns.of_view(seen.view), parameters.len(), couplings);
+                                let size = unknowns.view_block[seen.view].map_or(0, |block| unknowns.size(block));
+                                row.link_blocks(seen, size, parameters.len(), couplings);
                             }
                         }
                         if sequence.has_common_centre {
@@ -196,12 +191,38 @@ impl Normal {
             true
         });
     }
+
+    fn add_batch(&mut self, pool: &WorkerPool, points: Range<usize>) {
+        let (places, rows) = (&self.places, self.rows.as_slice());
+        let seen = &pool.layout.all_seen[pool.layout.seen_range(points)];
+        let mut weights = vec![0; places.of_view.len()];
+        seen.iter().for_each(|seen| weights[seen.view] += 1);
+        let (mut values, mut gradient) = (self.values.as_mut_slice(), self.gradient.as_mut_slice());
+        let cut = |ends: &[usize]| {
+            let (first, last) = (places.before[ends[0]], places.before[ends[1]]);
+            let values = split_off(&mut values, last.0 - first.0);
+            (Some(ends[0]..ends[1]), values, split_off(&mut gradient, last.1 - first.1))
+        };
+        let mut pieces: Vec<_> = even_cuts(pool.threads.pieces(), weights.into_iter()).windows(2).map(cut).collect();
+        // What is left is that of the groups: first, for nobody can share it.
+        pieces.insert(0, (None, values, gradient));
+        pool.threads.each(pieces, |(views, values, gradient)| {
+            vectorised(
+                #[inline(always)]
+                || match views {
+                    Some(views) => places.add_to_views(seen, rows, views, values, gradient),
+                    None => places.add_to_groups(seen, rows, values, gradient),
+                },
+            );
+            true
+        });
+    }
 }
 
-impl Cameras {
-    fn new(layout: &Layout, pattern: &Pattern, sequence: &MetricReconstruction) -> Self {
-        let unknowns = &layout.unknowns;
-        let places = |view: usize| {
+impl Places {
+    fn new(pattern: &Pattern, sequence: &MetricReconstruction) -> Self {
+        let unknowns = &pattern.unknowns;
+        let of_view = |view: usize| {
             let (own, group) = (unknowns.view_block[view], unknowns.group_block_of_view(sequence, view));
             let diagonal = |block: usize| {
                 let range = unknowns.range(block);
@@ -218,69 +239,25 @@ impl Cameras {
             let last = before[before.len() - 1];
             before.push(block.map_or(last, |block| (pattern.panels(0..block + 1).end, unknowns.range(block).end)));
         }
-        Self {
-            before,
-            places: (0..sequence.poses.len()).map(places).collect(),
-            diagonal: pattern.diagonal(),
-            values: vec![0.0; pattern.value_count()],
-            gradient: vec![0.0; pattern.dimension()],
-        }
+        Self { of_view: (0..sequence.poses.len()).map(of_view).collect(), before }
     }
 
-    /// What is known of the intrinsics beforehand.
-    fn add_priors(&mut self, sequence: &MetricReconstruction, layout: &Layout, priors: &[IntrinsicsPrior]) {
-        for (group, prior) in priors.iter().enumerate().take(sequence.intrinsics.len()) {
-            let Some(block) = layout.unknowns.group_block[group] else { continue };
-            for (index, parameter) in layout.unknowns.range(block).zip(&layout.unknowns.parameters[group]) {
-                let information = prior.information[*parameter as usize];
-                self.gradient[index] += information * prior.deviation(*parameter, &sequence.intrinsics[group]);
-                self.values[self.diagonal[index]] += information;
-            }
-        }
-    }
-
-    /// Adds the rows of a batch.
-    fn add_batch(&mut self, pool: &WorkerPool, points: Range<usize>, rows: &[Option<Weighted>]) {
-        let Self { places, values, gradient, before, .. } = self;
-        let seen = &pool.layout.all_seen()[pool.layout.seen_range(points)];
-        let mut weights = vec![0; places.len()];
-        seen.iter().for_each(|seen| weights[seen.view] += 1);
-        let (mut values, mut gradient) = (values.as_mut_slice(), gradient.as_mut_slice());
-        let cut = |ends: &[usize]| {
-            let (first, last) = (before[ends[0]], before[ends[1]]);
-            Sums::Views {
-                range: ends[0]..ends[1],
-                values: split_off(&mut values, last.0 - first.0),
-                gradient: split_off(&mut gradient, last.1 - first.1),
-            }
-        };
-        let mut pieces: Vec<Sums> = even_cuts(pool.threads.pieces(), weights.into_iter()).windows(2).map(cut).collect();
-        // First, for nobody can share it.
-        pieces.insert(0, Sums::Groups { values, gradient });
-        let batch = Batch { places, before, seen, rows };
-        pool.threads.each(pieces, |piece: Sums| {
-            vectorised(
-                #[inline(always)]
-                || match piece {
-                    Sums::Views { range, values, gradient } => batch.add_to_views(range, values, gradient),
-                    Sums::Groups { values, gradient } => batch.add_to_groups(values, gradient),
-                },
-            );
-            true
-        });
-    }
-}
-
-impl Batch<'_> {
     /// Adds to the blocks of a run of views.
     ///
     /// * `values`, `gradient`: those of these views
     #[inline(always)]
-    fn add_to_views(&self, views: Range<usize>, values: &mut [f64], gradient: &mut [f64]) {
+    fn add_to_views(
+        &self,
+        seen: &[Seen],
+        rows: &[Option<Weighted>],
+        views: Range<usize>,
+        values: &mut [f64],
+        gradient: &mut [f64],
+    ) {
         let (first_value, first_unknown) = self.before[views.start];
         let of_views = |place: Place| Place { start: place.start - first_value, ..place };
-        for (seen, row) in self.seen.iter().zip(self.rows).filter(|(seen, _)| views.contains(&seen.view)) {
-            let ViewPlaces { view: Some((first, unknowns, place)), group, cross } = self.places[seen.view] else {
+        for (seen, row) in seen.iter().zip(rows).filter(|(seen, _)| views.contains(&seen.view)) {
+            let ViewPlaces { view: Some((first, unknowns, place)), group, cross } = self.of_view[seen.view] else {
                 continue;
             };
             let Some(row) = row else { continue };
@@ -297,10 +274,10 @@ impl Batch<'_> {
     ///
     /// * `values`, `gradient`: those of the groups
     #[inline(always)]
-    fn add_to_groups(&self, values: &mut [f64], gradient: &mut [f64]) {
+    fn add_to_groups(&self, seen: &[Seen], rows: &[Option<Weighted>], values: &mut [f64], gradient: &mut [f64]) {
         let Some(&(first_value, first_unknown)) = self.before.last() else { return };
-        for (seen, row) in self.seen.iter().zip(self.rows) {
-            let (Some((first, free, place)), Some(row)) = (self.places[seen.view].group, row) else { continue };
+        for (seen, row) in seen.iter().zip(rows) {
+            let (Some((first, free, place)), Some(row)) = (self.of_view[seen.view].group, row) else { continue };
             let free = row.by_intrinsics(free);
             add_product(values, Place { start: place.start - first_value, ..place }, free, free);
             add_gradient(&mut gradient[first - first_unknown..], free, row.residual);

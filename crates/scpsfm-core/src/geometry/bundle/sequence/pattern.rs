@@ -1,6 +1,6 @@
 //! Where the blocks of the reduced system are that are not zero.
 
-use super::super::panel::PANEL_SHARE;
+use super::super::dense::PANEL_SHARE;
 use super::MetricReconstruction;
 use super::layout::{Layout, Unknowns};
 use crate::domain::StopToken;
@@ -19,8 +19,7 @@ const SQUARE_LIMIT_OF_COUPLED: usize = 3_000;
 pub(super) struct Pattern {
     /// Whether the values are those of a square matrix, column-major, of which only the lower triangle counts.
     pub is_square: bool,
-    /// First unknown of a block, and at the end their number.
-    pub offsets: Vec<usize>,
+    pub unknowns: Unknowns,
     /// Where a block column starts in `rows`.
     pub column_starts: Vec<usize>,
     /// Row blocks of the columns, ascending, first the diagonal.
@@ -30,7 +29,7 @@ pub(super) struct Pattern {
     /// Where the panel of a block column starts among the values.
     panel_starts: Vec<usize>,
     /// Distance between the columns of the panel of a block column.
-    strides: Vec<usize>,
+    pub strides: Vec<usize>,
 }
 
 /// A block among the values: its first, and the distance between its columns.
@@ -59,7 +58,12 @@ impl Pattern {
         for (view, block) in unknowns.view_block.iter().enumerate() {
             block.iter().for_each(|block| group_of[*block] = unknowns.group_block_of_view(sequence, view));
         }
-        let points_by_block = layout.points_by_block();
+        let mut points_by_block = vec![Vec::new(); blocks];
+        for point in 0..layout.point_count() {
+            for incident in layout.incident_blocks(point) {
+                points_by_block[incident.block as usize].push(point as u32);
+            }
+        }
         let (mut column_starts, mut rows) = (vec![0], Vec::new());
         // Column for which a row was listed last.
         let mut listed_for = vec![usize::MAX; blocks];
@@ -82,24 +86,23 @@ impl Pattern {
             rows[first..].sort_unstable();
             column_starts.push(rows.len());
         }
-        Some(Self::from_rows(unknowns.offsets.clone(), column_starts, rows))
+        Some(Self::from_rows(unknowns, column_starts, rows))
     }
 
-    /// A square matrix.
     fn square(unknowns: &Unknowns) -> Self {
-        let (offsets, blocks, n) = (unknowns.offsets.clone(), unknowns.block_count(), unknowns.count());
+        let (blocks, n) = (unknowns.block_count(), unknowns.count());
         let (mut column_starts, mut rows) = (vec![0], Vec::new());
         for column in 0..blocks {
             rows.extend(column as u32..blocks as u32);
             column_starts.push(rows.len());
         }
-        let mut panel_starts: Vec<usize> = offsets.iter().map(|offset| offset * (n + 1)).collect();
+        let mut panel_starts: Vec<usize> = unknowns.offsets.iter().map(|offset| offset * (n + 1)).collect();
         panel_starts[blocks] = n * n;
-        let lower = Self::from_rows(offsets, column_starts, rows);
-        Self { is_square: true, panel_starts, strides: vec![n; blocks], ..lower }
+        let strides = vec![n; blocks];
+        Self { is_square: true, panel_starts, strides, ..Self::from_rows(unknowns, column_starts, rows) }
     }
 
-    fn from_rows(offsets: Vec<usize>, column_starts: Vec<usize>, rows: Vec<u32>) -> Self {
+    fn from_rows(unknowns: &Unknowns, column_starts: Vec<usize>, rows: Vec<u32>) -> Self {
         let mut heights = Vec::with_capacity(rows.len());
         let (mut panel_starts, mut strides) = (vec![0], Vec::new());
         let mut values = 0;
@@ -107,30 +110,17 @@ impl Pattern {
             let mut height = 0;
             for &row in &rows[column_starts[column]..column_starts[column + 1]] {
                 heights.push(height as u32);
-                height += offsets[row as usize + 1] - offsets[row as usize];
+                height += unknowns.size(row as usize);
             }
-            values += height * (offsets[column + 1] - offsets[column]);
+            values += height * unknowns.size(column);
             panel_starts.push(values);
             strides.push(height);
         }
-        Self { is_square: false, offsets, column_starts, rows, heights, panel_starts, strides }
-    }
-
-    pub fn block_count(&self) -> usize {
-        self.offsets.len() - 1
-    }
-
-    pub fn dimension(&self) -> usize {
-        self.offsets[self.block_count()]
+        Self { is_square: false, unknowns: unknowns.clone(), column_starts, rows, heights, panel_starts, strides }
     }
 
     pub fn value_count(&self) -> usize {
-        self.panel_starts[self.block_count()]
-    }
-
-    /// Unknowns of a block.
-    pub fn size(&self, block: usize) -> usize {
-        self.offsets[block + 1] - self.offsets[block]
+        self.panel_starts[self.unknowns.block_count()]
     }
 
     /// Where the panels of a run of block columns are among the values.
@@ -138,12 +128,6 @@ impl Pattern {
         self.panel_starts[columns.start]..self.panel_starts[columns.end]
     }
 
-    /// Distance between the columns of the panel of a block column.
-    pub fn stride(&self, column: usize) -> usize {
-        self.strides[column]
-    }
-
-    /// A block column.
     pub fn column(&self, column: usize) -> Column<'_> {
         let range = self.column_starts[column]..self.column_starts[column + 1];
         Column { rows: &self.rows[range.clone()], heights: &self.heights[range], start: self.panel_starts[column] }
@@ -152,16 +136,16 @@ impl Pattern {
     /// Where a block is; `None` where it is zero.
     pub fn place(&self, row: usize, column: usize) -> Option<Place> {
         let start = self.column(column).start_of(row as u32)?;
-        Some(Place { start, stride: self.stride(column) })
+        Some(Place { start, stride: self.strides[column] })
     }
 
     /// Calls `take` with row, column and index of every value, those of the diagonal blocks' upper triangles too.
     pub fn for_each(&self, mut take: impl FnMut(usize, usize, usize)) {
-        for block in 0..self.block_count() {
-            for (k, column) in (self.offsets[block]..self.offsets[block + 1]).enumerate() {
+        for block in 0..self.unknowns.block_count() {
+            for (k, column) in self.unknowns.range(block).enumerate() {
                 let mut index = self.panel_starts[block] + k * self.strides[block];
-                for &row in &self.rows[self.column_starts[block]..self.column_starts[block + 1]] {
-                    for row in self.offsets[row as usize]..self.offsets[row as usize + 1] {
+                for &row in self.column(block).rows {
+                    for row in self.unknowns.range(row as usize) {
                         take(row, column, index);
                         index += 1;
                     }
@@ -173,25 +157,20 @@ impl Pattern {
     /// Where the diagonal is among the values, unknown after unknown.
     pub fn diagonal(&self) -> Vec<usize> {
         let of_block = |block: usize| {
-            let (start, stride) = (self.panel_starts[block], self.stride(block));
-            (0..self.size(block)).map(move |k| start + k * (stride + 1))
+            let (start, stride) = (self.panel_starts[block], self.strides[block]);
+            (0..self.unknowns.size(block)).map(move |k| start + k * (stride + 1))
         };
-        (0..self.block_count()).flat_map(of_block).collect()
+        (0..self.unknowns.block_count()).flat_map(of_block).collect()
     }
 }
 
-/// A block column.
 pub(super) struct Column<'a> {
-    rows: &'a [u32],
+    pub rows: &'a [u32],
     heights: &'a [u32],
     start: usize,
 }
 
-impl<'a> Column<'a> {
-    pub fn rows(&self) -> &'a [u32] {
-        self.rows
-    }
-
+impl Column<'_> {
     /// Where a row block starts among the values; `None` where it is not listed.
     #[inline]
     pub fn start_of(&self, row: u32) -> Option<usize> {

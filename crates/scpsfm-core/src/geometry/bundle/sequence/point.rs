@@ -1,9 +1,21 @@
-//! A point's block of the normal equations, and its elimination.
+//! A point by itself: what it costs, its block of the normal equations and its elimination, and its own minimum with
+//! the cameras as they are.
 
 use nalgebra::Vector3;
 
+use super::super::Loss;
+use super::super::engine::POINT_DAMPING;
 use super::super::metric::POINT;
-use super::super::reduced::POINT_DAMPING;
+use super::super::problem::{UNDEFINED_SQUARED, usable_squared_norm};
+use super::MetricReconstruction;
+use super::layout::Seen;
+use super::normal::Weighted;
+use super::worker_pool::WorkerPool;
+
+/// Gauss-Newton steps of a point at most: they converge quadratically from nearby.
+const STEPS: usize = 3;
+/// Share of its cost by which a point's last step has to lower it for another to follow.
+const WORTHWHILE: f64 = 1e-2;
 
 /// Information on a point and half the gradient of the cost by it.
 #[derive(Debug, Clone, Copy)]
@@ -62,10 +74,11 @@ impl PointFactor {
         Vector3::new(first, second, (x[2] - l20 * first - l21 * second) * l22)
     }
 
-    /// `L'^-1 x`
+    /// `L'^-1 L^-1 x`
     #[inline(always)]
-    pub fn unwhiten(&self, x: &Vector3<f64>) -> Vector3<f64> {
+    pub fn solve(&self, x: &Vector3<f64>) -> Vector3<f64> {
         let [l00, l10, l20, l11, l21, l22] = self.0;
+        let x = self.whiten(x);
         let third = x[2] * l22;
         let second = (x[1] - l21 * third) * l11;
         Vector3::new((x[0] - l10 * second - l20 * third) * l00, second, third)
@@ -93,6 +106,73 @@ impl PointFactor {
     }
 }
 
+/// Sum of the loss over the observations of one point, were it at this position.
+pub(super) fn cost_of_point(
+    sequence: &MetricReconstruction,
+    seen: &[Seen],
+    position: &Vector3<f64>,
+    loss: Loss,
+) -> f64 {
+    let mut sum = 0.0;
+    for seen in seen {
+        let at = sequence.poses[seen.view].apply(position);
+        let residual = sequence.intrinsics_of(seen.view).project(&at) - seen.xy;
+        sum += loss.cost(seen.weight * usable_squared_norm(&residual).unwrap_or(UNDEFINED_SQUARED));
+    }
+    sum
+}
+
+/// Moves every point towards its minimum with the cameras as they are (embedded point iterations; Jeong, Nister,
+/// Steedly, Szeliski, Kweon 2012, "Pushing the envelope of modern methods for bundle adjustment"); by how much that
+/// lowers the cost. `None` when it was stopped.
+///
+/// Long chains of views bend at next to no cost. Cameras and points that follow a bend along its tangent are stretched
+/// across its axis and not along it, which costs by the square of the angle; points that are put where the moved
+/// cameras see them leave the third power.
+pub(super) fn iterate_points(sequence: &mut MetricReconstruction, loss: Loss, pool: &WorkerPool) -> Option<f64> {
+    let of_point = |point: usize| Some(iterate(sequence, pool.layout.seen(point), sequence.points[point], loss));
+    let iterated = pool.of_points(of_point)?;
+    let mut lowered = 0.0;
+    for (slot, (position, by)) in sequence.points.iter_mut().zip(iterated) {
+        *slot = position;
+        lowered += by;
+    }
+    Some(lowered)
+}
+
+/// A point nearer its minimum, and by how much it costs less there.
+fn iterate(
+    sequence: &MetricReconstruction,
+    seen: &[Seen],
+    mut position: Vector3<f64>,
+    loss: Loss,
+) -> (Vector3<f64>, f64) {
+    let initial_cost = cost_of_point(sequence, seen, &position, loss);
+    let mut cost = initial_cost;
+    for _ in 0..STEPS {
+        let mut block = PointBlock::ZERO;
+        for row in seen.iter().filter_map(|seen| Weighted::new(sequence, &position, seen, &[], loss)) {
+            block.add(&row.point, row.residual);
+        }
+        if sequence.has_common_centre {
+            block.hold_length(&position);
+        }
+        let Some(factor) = block.factor(0.0) else { break };
+        let moved = position - factor.solve(&block.gradient);
+        let moved_cost = cost_of_point(sequence, seen, &moved, loss);
+        let lower = moved_cost < cost && moved.iter().all(|value| value.is_finite());
+        if !lower {
+            break;
+        }
+        let gain = cost - moved_cost;
+        (position, cost) = (moved, moved_cost);
+        if gain < WORTHWHILE * cost {
+            break;
+        }
+    }
+    (position, initial_cost - cost)
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -110,7 +190,7 @@ mod tests {
                 block.hold_length(&direction);
             }
             let factor = block.factor(0.0).expect("positive definite");
-            factor.unwhiten(&factor.whiten(&block.gradient))
+            factor.solve(&block.gradient)
         };
         assert!(across.iter().all(|row| row.dot(&direction).abs() < 1e-12));
         assert!(step(false).dot(&direction).abs() > 1.0, "{}", step(false));

@@ -5,13 +5,12 @@ use std::ops::Range;
 
 use nalgebra::Vector3;
 
-use super::super::cholesky;
+use super::super::dense::{self, PANEL_SHARE};
 use super::super::metric::{POINT, POSE};
-use super::super::panel::{self, PANEL_SHARE};
 use super::MetricReconstruction;
 use super::layout::Layout;
 use super::normal::Normal;
-use super::pattern::{Column, Pattern};
+use super::pattern::Pattern;
 use super::solver::SparseCholesky;
 use super::worker_pool::{POINTS_BETWEEN_QUESTIONS, WorkerPool, split_off};
 use crate::parallel::even_cuts;
@@ -38,19 +37,12 @@ pub(super) struct Reduced {
     pub by_panels: bool,
 }
 
-/// Some block columns of the system, for a batch to be subtracted from.
-struct Columns<'a> {
-    range: Range<usize>,
-    values: &'a mut [f64],
-    vector: &'a mut [f64],
-}
-
 impl Reduced {
     pub fn new(layout: &Layout, pattern: Pattern) -> Self {
         Self {
             by_panels: pattern.is_square && layout.coupled_share() >= PANEL_SHARE,
             values: vec![0.0; pattern.value_count()],
-            vector: vec![0.0; pattern.dimension()],
+            vector: vec![0.0; pattern.unknowns.count()],
             whitened: Vec::new(),
             whitened_gradients: Vec::new(),
             pattern,
@@ -62,8 +54,8 @@ impl Reduced {
     /// Batch by batch: first the points are whitened, each by itself, then taken from the block columns that they are
     /// coupled with, in their order; by panels, one product does.
     pub fn build(&mut self, normal: &Normal, damping: f64, pool: &WorkerPool) -> bool {
-        self.values.copy_from_slice(&normal.cameras.values);
-        for (slot, gradient) in self.vector.iter_mut().zip(&normal.cameras.gradient) {
+        self.values.copy_from_slice(&normal.values);
+        for (slot, gradient) in self.vector.iter_mut().zip(&normal.gradient) {
             *slot = -gradient;
         }
         for points in pool.batches() {
@@ -81,7 +73,7 @@ impl Reduced {
 
     /// Whitens the couplings and gradients of a batch of points; `false` when a block cannot be factored.
     fn whiten(&mut self, normal: &Normal, damping: f64, pool: &WorkerPool, points: Range<usize>) -> bool {
-        let (layout, by_panels, rows) = (pool.layout, self.by_panels, self.pattern.dimension());
+        let (layout, by_panels, rows) = (pool.layout, self.by_panels, self.vector.len());
         let length = |points: Range<usize>| match by_panels {
             true => POINT * rows * points.filter(|point| layout.is_coupled(*point)).count(),
             false => layout.couplings_of(points).len(),
@@ -98,7 +90,6 @@ impl Reduced {
             (range, whitened, whitened_gradients)
         };
         let pieces = pool.cut(points).windows(2).map(cut).collect();
-        let pattern = &self.pattern;
         pool.threads.each(pieces, |(points, mut whitened, whitened_gradients)| {
             vectorised(
                 #[inline(always)]
@@ -118,10 +109,10 @@ impl Reduced {
                         *whitened_gradient = factor.whiten(&block.gradient);
                         for incident in incident_blocks {
                             let (block, start) = (incident.block as usize, incident.coupling as usize);
-                            let size = pattern.size(block);
+                            let unknowns = layout.unknowns.range(block);
+                            let size = unknowns.len();
                             let coupling = &couplings[start..start + POINT * size];
-                            let (place, stride) =
-                                if by_panels { (pattern.offsets[block], rows) } else { (start, size) };
+                            let (place, stride) = if by_panels { (unknowns.start, rows) } else { (start, size) };
                             factor.whiten_coupling(coupling, &mut whitened[place..], stride);
                         }
                     }
@@ -133,20 +124,22 @@ impl Reduced {
 
     /// Takes from the system what the points of a batch subtract, as columns of a panel.
     fn subtract_panel(&mut self, pool: &WorkerPool, points: Range<usize>) {
-        let rows = self.pattern.dimension();
+        let rows = self.vector.len();
         let first = points.start;
         let coupled = points.filter(|point| pool.layout.is_coupled(*point)).map(|point| point - first);
         let whitened = &self.whitened[..POINT * rows * coupled.clone().count()];
-        panel::subtract(whitened, rows, &mut self.values);
+        dense::subtract_panel(whitened, rows, &mut self.values);
         let gradients = coupled.flat_map(|point| self.whitened_gradients[point].iter());
         for (column, gradient) in whitened.chunks_exact(rows.max(1)).zip(gradients) {
             self.vector.iter_mut().zip(column).for_each(|(slot, value)| *slot += value * gradient);
         }
     }
 
+    /// The same point by point, from the block columns that they are coupled with; `false` when it was stopped.
     fn subtract(&mut self, pool: &WorkerPool, points: Range<usize>) -> bool {
         let Self { pattern, values, vector, whitened, whitened_gradients, .. } = self;
-        let mut weights = vec![0; pattern.block_count()];
+        let unknowns = &pattern.unknowns;
+        let mut weights = vec![0; unknowns.block_count()];
         for incident in points.clone().flat_map(|point| pool.layout.incident_blocks(point)) {
             weights[incident.block as usize] += 1;
         }
@@ -154,24 +147,23 @@ impl Reduced {
         let cut = |ends: &[usize]| {
             let range = ends[0]..ends[1];
             let values = split_off(&mut values, pattern.panels(range.clone()).len());
-            let unknowns = pattern.offsets[range.end] - pattern.offsets[range.start];
-            Columns { vector: split_off(&mut vector, unknowns), range, values }
+            let vector = split_off(&mut vector, unknowns.offsets[range.end] - unknowns.offsets[range.start]);
+            (range, values, vector)
         };
-        let cuts = even_cuts(pool.threads.pieces(), weights.into_iter());
-        let pieces = cuts.windows(2).map(cut).collect();
-        let batch = Whitened { points, whitened, whitened_gradients };
-        pool.threads.each(pieces, |piece: Columns| {
+        let pieces = even_cuts(pool.threads.pieces(), weights.into_iter()).windows(2).map(cut).collect();
+        let batch = Batch { pattern, pool, points, whitened, whitened_gradients };
+        pool.threads.each(pieces, |(columns, values, vector)| {
             vectorised(
                 #[inline(always)]
-                || piece.subtract(pattern, &batch, pool),
+                || batch.subtract_from(columns, values, vector),
             )
         })
     }
 
     /// Marquardt's damping, and what holds the gauge.
     pub fn damp(&mut self, normal: &Normal, damping: f64) {
-        for &index in &normal.cameras.diagonal {
-            let diagonal = normal.cameras.values[index];
+        for &index in &normal.diagonal {
+            let diagonal = normal.values[index];
             // Nothing is known of this unknown: it stays where it is.
             let undetermined = if diagonal > 0.0 { 0.0 } else { 1.0 };
             self.values[index] += (damping + GAUGE_DAMPING) * diagonal + undetermined;
@@ -184,53 +176,54 @@ impl Reduced {
     pub fn solve(&mut self, sparse: Option<&mut SparseCholesky>) -> bool {
         let is_solved = match sparse {
             Some(sparse) => sparse.solve(&self.values, &mut self.vector),
-            None => cholesky::solve(&mut self.values, &mut self.vector),
+            None => dense::solve(&mut self.values, &mut self.vector),
         };
         is_solved && self.vector.iter().all(|value| value.is_finite())
     }
 }
 
 /// What the points of a batch subtract is made of.
-struct Whitened<'a> {
+struct Batch<'a> {
+    pattern: &'a Pattern,
+    pool: &'a WorkerPool<'a>,
     points: Range<usize>,
     whitened: &'a [f64],
     whitened_gradients: &'a [Vector3<f64>],
 }
 
-impl Columns<'_> {
-    /// Takes from these columns what the points that are coupled with them subtract; `false` when it was stopped.
+impl Batch<'_> {
+    /// Takes from these block columns what the points that are coupled with them subtract; `false` when it was stopped.
     #[inline(always)]
-    fn subtract(self, pattern: &Pattern, batch: &Whitened, pool: &WorkerPool) -> bool {
-        let layout = pool.layout;
-        let first_coupling = layout.couplings_of(batch.points.clone()).start;
-        let (first_value, first_unknown) =
-            (pattern.panels(self.range.clone()).start, pattern.offsets[self.range.start]);
-        for (point, whitened_gradient) in batch.points.clone().zip(batch.whitened_gradients) {
-            if point.is_multiple_of(POINTS_BETWEEN_QUESTIONS) && pool.stop.is_stopped() {
+    fn subtract_from(&self, columns: Range<usize>, values: &mut [f64], vector: &mut [f64]) -> bool {
+        let (layout, pattern, unknowns) = (self.pool.layout, self.pattern, &self.pattern.unknowns);
+        let first_coupling = layout.couplings_of(self.points.clone()).start;
+        let (first_value, first_unknown) = (pattern.panels(columns.clone()).start, unknowns.offsets[columns.start]);
+        for (point, whitened_gradient) in self.points.clone().zip(self.whitened_gradients) {
+            if point.is_multiple_of(POINTS_BETWEEN_QUESTIONS) && self.pool.stop.is_stopped() {
                 return false;
             }
             let incident_blocks = layout.incident_blocks(point);
-            let whitened = &batch.whitened[layout.couplings_of(point..point + 1).start - first_coupling..];
-            let first = incident_blocks.partition_point(|incident| (incident.block as usize) < self.range.start);
+            let whitened = &self.whitened[layout.couplings_of(point..point + 1).start - first_coupling..];
+            let first = incident_blocks.partition_point(|incident| (incident.block as usize) < columns.start);
             for (k, column) in incident_blocks.iter().enumerate().skip(first) {
                 let block = column.block as usize;
-                if block >= self.range.end {
+                if block >= columns.end {
                     break;
                 }
-                let (size, stride) = (pattern.size(block), pattern.stride(block));
+                let (size, stride) = (unknowns.size(block), pattern.strides[block]);
                 let right = factor_columns(&whitened[column.coupling as usize..][..POINT * size]);
                 let [x, y, z]: &[f64; POINT] = whitened_gradient.as_ref();
-                let vector = &mut self.vector[pattern.offsets[block] - first_unknown..][..size];
+                let vector = &mut vector[unknowns.offsets[block] - first_unknown..][..size];
                 for (((slot, a), b), c) in vector.iter_mut().zip(right[0]).zip(right[1]).zip(right[2]) {
                     *slot += a * x + b * y + c * z;
                 }
-                let places: Column = pattern.column(block);
+                let places = pattern.column(block);
                 for row in &incident_blocks[k..] {
                     // Pattern and incident blocks come from the same layout, so that there is a place.
                     let Some(start) = places.start_of(row.block) else { continue };
-                    let height = pattern.size(row.block as usize);
+                    let height = unknowns.size(row.block as usize);
                     let left = &whitened[row.coupling as usize..][..POINT * height];
-                    let values = &mut self.values[start - first_value..];
+                    let values = &mut values[start - first_value..];
                     match left.first_chunk::<{ POINT * POSE }>() {
                         Some(left) if height == POSE => subtract_from_pose(values, stride, left, right),
                         _ => subtract_product(values, stride, factor_columns(left), right),
@@ -273,18 +266,13 @@ pub(super) fn substitute(
             let step = &step[layout.unknowns.range(incident.block as usize)];
             let coupling = &couplings[incident.coupling as usize..][..POINT * step.len()];
             for (k, column) in coupling.chunks_exact(step.len()).enumerate() {
-                gradient[k] += dot(column, step);
+                gradient[k] += column.iter().zip(step).map(|(a, b)| a * b).sum::<f64>();
             }
         }
-        let shift: Vector3<f64> = factor.unwhiten(&factor.whiten(&gradient));
+        let shift = factor.solve(&gradient);
         shift.iter().all(|value| value.is_finite()).then(|| from.points[point] - shift)
     };
     pool.of_points(place).map(|points| moved.points = points).is_some()
-}
-
-#[inline(always)]
-fn dot(a: &[f64], b: &[f64]) -> f64 {
-    a.iter().zip(b).map(|(a, b)| a * b).sum()
 }
 
 /// Subtracts `left right'` from a block of six rows; both factors have three columns.

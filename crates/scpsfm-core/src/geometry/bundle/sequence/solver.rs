@@ -20,7 +20,7 @@ pub(super) struct SparseCholesky {
 impl SparseCholesky {
     /// Orders and analyses; `None` without unknowns, or without the memory for it.
     pub fn new(pattern: &Pattern) -> Option<Self> {
-        let n = pattern.dimension();
+        let n = pattern.unknowns.count();
         if n == 0 {
             return None;
         }
@@ -55,12 +55,12 @@ impl SparseCholesky {
 
 /// The pattern, unknown by unknown. What it holds above the diagonal is ignored in the factorisation.
 fn structure(pattern: &Pattern) -> SymbolicSparseColMat<usize> {
-    let n = pattern.dimension();
+    let n = pattern.unknowns.count();
     let (mut starts, mut rows) = (vec![0], Vec::with_capacity(pattern.value_count()));
-    for block in 0..pattern.block_count() {
-        for _ in 0..pattern.size(block) {
-            for &row in pattern.column(block).rows() {
-                rows.extend(pattern.offsets[row as usize]..pattern.offsets[row as usize + 1]);
+    for block in 0..pattern.unknowns.block_count() {
+        for _ in pattern.unknowns.range(block) {
+            for &row in pattern.column(block).rows {
+                rows.extend(pattern.unknowns.range(row as usize));
             }
             starts.push(rows.len());
         }
@@ -71,15 +71,14 @@ fn structure(pattern: &Pattern) -> SymbolicSparseColMat<usize> {
 /// An order of the unknowns that keeps the factor sparse, found on the blocks: which unknown comes when, and when each
 /// comes.
 fn order(pattern: &Pattern) -> Option<(Vec<usize>, Vec<usize>)> {
-    let blocks = pattern.block_count();
+    let blocks = pattern.unknowns.block_count();
     let rows: Vec<usize> = pattern.rows.iter().map(|row| *row as usize).collect();
     let graph = SymbolicSparseColMatRef::new_checked(blocks, blocks, &pattern.column_starts, None, &rows);
     let (mut order, mut inverse) = (vec![0; blocks], vec![0; blocks]);
     let mut memory = MemBuffer::try_new(amd::order_scratch::<usize>(blocks, rows.len())).ok()?;
     let stack = MemStack::new(&mut memory);
     amd::order(&mut order, &mut inverse, graph, Default::default(), stack).ok()?;
-    let forward: Vec<usize> =
-        order.iter().flat_map(|&block| pattern.offsets[block]..pattern.offsets[block + 1]).collect();
+    let forward: Vec<usize> = order.iter().flat_map(|&block| pattern.unknowns.range(block)).collect();
     let mut inverse = vec![0; forward.len()];
     forward.iter().enumerate().for_each(|(place, &unknown)| inverse[unknown] = place);
     Some((forward, inverse))

@@ -2,7 +2,7 @@
 
 use std::ops::Range;
 
-use super::layout::{Layout, Unknowns};
+use super::layout::Layout;
 use super::normal::Normal;
 use super::pattern::Pattern;
 use super::reduced::Reduced;
@@ -16,8 +16,10 @@ use crate::parallel::Threads;
 /// What the observations say of the poses and of all intrinsics, those that views have of their own and those that they
 /// share, nothing damped.
 pub struct System {
-    unknowns: Unknowns,
-    reduced: Reduced,
+    pattern: Pattern,
+    values: Vec<f64>,
+    /// Half the downward gradient of the cost.
+    pub negative_gradient: Vec<f64>,
     /// The diagonal were the points and everything else known.
     pub known: Vec<f64>,
 }
@@ -35,41 +37,34 @@ impl System {
         normal.fill(reconstruction, &[], Loss::Squared, &pool);
         let mut reduced = Reduced::new(&layout, pattern);
         let possible = reduced.build(&normal, 0.0, &pool);
-        let known = normal.cameras.diagonal.iter().map(|&index| normal.cameras.values[index]).collect();
-        possible.then_some(Self { unknowns: layout.unknowns, reduced, known })
-    }
-
-    pub fn dimension(&self) -> usize {
-        self.unknowns.count()
+        let known = normal.diagonal.iter().map(|&index| normal.values[index]).collect();
+        let Reduced { pattern, values, vector: negative_gradient, .. } = reduced;
+        possible.then_some(Self { pattern, values, negative_gradient, known })
     }
 
     /// Views that see something, and their unknowns: the pose, and the focal length where it is the view's own.
     pub fn of_views(&self) -> impl Iterator<Item = (usize, Range<usize>)> {
-        let views = self.unknowns.view_block.iter().enumerate();
-        views.filter_map(|(view, block)| Some((view, self.unknowns.range((*block)?))))
+        let unknowns = &self.pattern.unknowns;
+        let views = unknowns.view_block.iter().enumerate();
+        views.filter_map(move |(view, block)| Some((view, unknowns.range((*block)?))))
     }
 
     /// Camera group, intrinsic and unknown of all that views share.
     pub fn of_groups(&self) -> impl Iterator<Item = (usize, Parameter, usize)> {
-        let Unknowns { group_block, parameters, .. } = &self.unknowns;
-        let blocks = group_block.iter().zip(parameters).enumerate();
-        blocks.flat_map(|(group, (block, parameters))| {
-            let unknowns = block.map_or(0..0, |block| self.unknowns.range(block));
+        let unknowns = &self.pattern.unknowns;
+        let blocks = unknowns.group_block.iter().zip(&unknowns.parameters).enumerate();
+        blocks.flat_map(move |(group, (block, parameters))| {
+            let unknowns = block.map_or(0..0, |block| unknowns.range(block));
             parameters.iter().zip(unknowns).map(move |(parameter, unknown)| (group, *parameter, unknown))
         })
     }
 
     /// Calls `take` with row, column and value of the lower triangle.
     pub fn for_each(&self, mut take: impl FnMut(usize, usize, f64)) {
-        self.reduced.pattern.for_each(|row, column, index| {
+        self.pattern.for_each(|row, column, index| {
             if row >= column {
-                take(row, column, self.reduced.values[index]);
+                take(row, column, self.values[index]);
             }
         });
-    }
-
-    /// Half the downward gradient of the cost.
-    pub fn negative_gradient(&self) -> &[f64] {
-        &self.reduced.vector
     }
 }

@@ -138,7 +138,7 @@ fn compare(
 ) {
     let free = Free { models, views: Some(views) };
     let (layout, pattern) = laid_out(sequence, observations, &free);
-    let cameras = pattern.dimension();
+    let cameras = pattern.unknowns.count();
     assert_eq!(cameras, unknowns, "{what}");
     let mut normal = Normal::new(&layout, &pattern, sequence);
     let stop = StopToken::default();
@@ -151,9 +151,9 @@ fn compare(
         assert!(error < 1e-6 * (1.0 + information.amax()), "{what}: {found} instead of {expected}");
     };
     let mut among = DMatrix::zeros(cameras, cameras);
-    pattern.for_each(|row, column, index| among[(row.max(column), row.min(column))] = normal.cameras.values[index]);
+    pattern.for_each(|row, column, index| among[(row.max(column), row.min(column))] = normal.values[index]);
     for column in 0..cameras {
-        close(normal.cameras.gradient[column], gradient[column], "gradient");
+        close(normal.gradient[column], gradient[column], "gradient");
         for row in column..cameras {
             close(among[(row, column)], information[(row, column)], "cameras");
         }
@@ -187,7 +187,7 @@ fn what_is_known_beforehand_takes_part() {
         assert!(normal.fill(&sequence, priors, Loss::Squared, &pool));
         let block = layout.unknowns.group_block[2].expect("free");
         let unknown = layout.unknowns.range(block).start;
-        (normal.cameras.values[normal.cameras.diagonal[unknown]], normal.cameras.gradient[unknown])
+        (normal.values[normal.diagonal[unknown]], normal.gradient[unknown])
     };
     let (information, gradient) = with(&[]);
     let (informed, pulled) = with(&[prior, prior, prior]);

@@ -1,8 +1,39 @@
-//! Cholesky factorisation of the reduced system, in place.
+//! Dense reduced systems: the product by which many points are eliminated at a time, and the factorisation.
 
 use faer::dyn_stack::{MemBuffer, MemStack};
 use faer::linalg::cholesky::llt;
-use faer::{MatMut, MatRef, Par};
+use faer::linalg::matmul::triangular::{self, BlockStructure};
+use faer::prelude::ReborrowMut;
+use faer::{Accum, MatMut, MatRef, Par};
+
+/// Share of all pairs of point and camera that must be observed for the points to be eliminated by panels, which
+/// calculate with zeros for the others: a product of panels takes a quarter of the time of its pairs or less, whose
+/// number falls with the square of the share. A step of 37 views that see .53 of 390 points takes 4.9 ms by panels and
+/// 8.0 by pairs.
+pub(super) const PANEL_SHARE: f64 = 0.5;
+/// Columns of a panel: enough for the product to run at full speed, few enough for a second-level cache.
+pub(super) const PANEL_COLUMNS: usize = 256;
+
+/// Subtracts the product of a panel with its transpose from the lower triangle of a square matrix.
+///
+/// * `panel`, `matrix`: column-major, of so many rows
+pub(super) fn subtract_panel(panel: &[f64], rows: usize, matrix: &mut [f64]) {
+    let mut block = MatMut::from_column_major_slice_mut(matrix, rows, rows);
+    for columns in panel.chunks(PANEL_COLUMNS * rows.max(1)) {
+        let columns = MatRef::from_column_major_slice(columns, rows, columns.len() / rows.max(1));
+        triangular::matmul(
+            block.rb_mut(),
+            BlockStructure::TriangularLower,
+            Accum::Add,
+            columns,
+            BlockStructure::Rectangular,
+            columns.transpose(),
+            BlockStructure::Rectangular,
+            -1.0,
+            Par::Seq,
+        );
+    }
+}
 
 /// Solves `A x = b` in place of `b`; `false` when `A` is not positive definite.
 ///
