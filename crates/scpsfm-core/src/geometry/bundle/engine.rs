@@ -175,6 +175,8 @@ impl<'a, const C: usize, const P: usize, T: BundleProblem<C, P>> NormalEquations
         let dimension = self.vector.len();
         self.matrix.fill(0.0);
         self.vector.fill(0.0);
+        // What an attempt left that ended before.
+        self.panel.iter_mut().for_each(Vec::clear);
         for point in 0..self.factors.len() {
             let range = self.layout.starts[point]..self.layout.starts[point + 1];
             let mut block = self.point_blocks[point];
@@ -208,9 +210,8 @@ impl<'a, const C: usize, const P: usize, T: BundleProblem<C, P>> NormalEquations
                 add_block(&mut self.matrix, dimension, (seen.view, seen.view), camera, &Matrix2::identity(), camera);
             }
         }
-        if let Some(panel) = &mut self.panel {
+        if let Some(panel) = &self.panel {
             dense::subtract_panel(panel, dimension, &mut self.matrix);
-            panel.clear();
         }
         true
     }
